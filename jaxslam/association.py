@@ -1,0 +1,115 @@
+"""Which landmark each measurement of a frame came from: `known` or `maximum_likelihood`.
+
+Works on blocks of n particles, on arrays [K, n] of slots and log densities. Every measurement
+takes the slot of greatest density, if that beats the alternatives ("new" and "clutter").
+"""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.landmarks import score
+
+NEW, CLUTTER, PADDING = -1, -2, -3
+
+
+def associate(config, scorer, measurements, new, clutter, params):
+    """Slots [K, n] matched by the measurements, or `NEW`, `CLUTTER`, `PADDING`.
+
+    `scorer`: prediction of every slot, [M, n]. `new` [K] and `clutter` []: log densities of the
+    alternatives (`clutter` -inf when the configuration has none). No gradient flows through.
+    """
+    scorer, new, clutter, params = jax.lax.stop_gradient((scorer, new, clutter, params))
+    new = jnp.broadcast_to(new, measurements.valid.shape)
+    if config.association == "known":
+        slot = _known(config, scorer, measurements, clutter, params)
+    else:
+        # Padding wants no landmark, so that it takes none from a measurement.
+        threshold = jnp.where(measurements.valid, jnp.maximum(new, clutter), jnp.inf)
+        slot = _maximum_likelihood(config, scorer, measurements, threshold, params)
+        other = jnp.where(new >= clutter, NEW, CLUTTER)
+        slot = jnp.where(slot < 0, other[:, None], slot)
+    return jnp.where(measurements.valid[:, None], slot, PADDING)
+
+
+def _known(config, scorer, measurements, clutter, params):
+    """Identity i is slot i; an occupied slot that fits worse than clutter does is not taken."""
+    slots, lanes = scorer.constant.shape
+    slot = jnp.clip(measurements.identity, 0, slots - 1)
+    rows = jax.tree.map(lambda leaf: leaf[slot], scorer)
+    density = score(config.sensor, rows, *_columns(measurements), params)
+    occupied = rows.constant > -jnp.inf
+    slot = jnp.broadcast_to(slot[:, None], (len(slot), lanes))
+    slot = jnp.where(occupied, jnp.where(density >= clutter, slot, CLUTTER), NEW)
+    return jnp.where((measurements.identity < slots)[:, None], slot, NEW)
+
+
+def _maximum_likelihood(config, scorer, measurements, threshold, params):
+    """Best slot of each measurement, or -1; exclusive: the best pair first, over the frame."""
+    value, cov = _columns(measurements)
+    slots, lanes = scorer.constant.shape
+    start = (
+        jnp.broadcast_to(threshold[:, None], (len(threshold), lanes)).astype(scorer.constant.dtype),
+        jnp.full((len(threshold), lanes), -1, jnp.int32),
+    )
+
+    # A running "is it greater" is plain vector code on a CPU; argmax is not (ten times slower).
+    def look(m, best):
+        row = jax.tree.map(lambda leaf: leaf[m], scorer)
+        density = score(config.sensor, row, value, cov, params)
+        better = density > best[0]
+        return jnp.where(better, density, best[0]), jnp.where(better, m, best[1])
+
+    best = jax.lax.fori_loop(0, slots, look, start)
+    if not config.exclusive:
+        return best[1]
+    return _settle(config, scorer, measurements, threshold, params, best)
+
+
+def _settle(config, scorer, measurements, threshold, params, best):
+    """Resolve measurements that chose the same slot: the loser goes on to its next best slot.
+
+    Deferred acceptance (Gale and Shapley 1962). Both sides rank a pair by the same density, so the
+    outcome is that of taking the best free pair over and over, whatever the order. Conflicts are
+    rare: each round moves one loser of every particle, and scores only that measurement.
+    """
+    index = jnp.arange(len(threshold))[:, None]
+    value, cov = jnp.asarray(measurements.value).T, jnp.asarray(measurements.cov).T
+    slots = jnp.arange(scorer.constant.shape[0], dtype=jnp.int32)[:, None]
+
+    def losers(best):
+        density, slot = best
+        same = (slot[:, None] == slot[None]) & (slot[:, None] >= 0)
+        stronger = (density[None] > density[:, None]) | (
+            (density[None] == density[:, None]) & (index[None] < index[:, None])
+        )
+        return (same & stronger).any(1)
+
+    def move(carry):
+        (density, slot), lost = carry
+        loser = jnp.where(lost, index, len(threshold)).min(0)
+        any_lost = loser < len(threshold)
+        k = jnp.minimum(loser, len(threshold) - 1)
+        here = index == k
+        held = jnp.where(here, density, 0).sum(0), jnp.where(here, slot, 0).sum(0)
+        table = score(
+            config.sensor, scorer, tuple(v[k] for v in value), tuple(c[k] for c in cov), params
+        )
+        further = (table < held[0]) | ((table == held[0]) & (slots > held[1]))
+        table = jnp.where(further, table, -jnp.inf)
+        top = table.max(0)
+        next_slot = jnp.where(table == top, slots, len(slots)).min(0)
+        found = top > threshold[k]
+        change = here & any_lost
+        density = jnp.where(change, jnp.where(found, top, -jnp.inf), density)
+        slot = jnp.where(change, jnp.where(found, next_slot, -1), slot)
+        return (density, slot), losers((density, slot))
+
+    settled = jax.lax.while_loop(lambda carry: carry[1].any(), move, (best, losers(best)))
+    return settled[0][1]
+
+
+def _columns(measurements):
+    """Value and covariance as tuples of [K, 1] columns, to broadcast over particles."""
+    value = tuple(measurements.value[:, i, None] for i in range(2))
+    cov = tuple(measurements.cov[:, i, None] for i in range(3))
+    return value, cov

@@ -1,0 +1,190 @@
+"""What a run is told: `Config` (static, decides shapes and branches) and `Params` (numbers).
+
+A value that changes a shape or a branch belongs to `Config`; one that changes a number, and could
+be learnt, to `Params`.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+SENSORS = ("position", "range_bearing", "bearing")
+ASSOCIATIONS = ("maximum_likelihood", "known")
+PROPOSALS = ("prior",)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Static settings of the filter; one compilation per distinct `Config`.
+
+    `resample_threshold` t: resample when ESS < t * particles (0: never, 1 or more: every frame).
+    `exclusive`: two measurements of one frame never share a landmark. `clutter`: a measurement may
+    come from nothing. `forgetting`: landmarks carry an existence log-odds and are freed below zero
+    (None: on, unless identities are known). `block`: particles worked on at once, so that
+    temporaries stay in cache; it changes the speed, never the result.
+
+    Raises `ValueError` for a value that is not allowed.
+    """
+
+    sensor: str = "range_bearing"
+    association: str = "maximum_likelihood"
+    particles: int = 1000
+    landmarks: int = 64
+    measurements: int = 16
+    resample_threshold: float = 0.5
+    exclusive: bool = True
+    clutter: bool = True
+    forgetting: bool | None = None
+    proposal: str = "prior"
+    block: int = 256
+
+    def __post_init__(self):
+        for name, allowed in (
+            ("sensor", SENSORS),
+            ("association", ASSOCIATIONS),
+            ("proposal", PROPOSALS),
+        ):
+            value = getattr(self, name)
+            if value not in allowed:
+                raise ValueError(f"Config.{name}: {value!r} is not one of {', '.join(allowed)}")
+        for name in ("particles", "landmarks", "measurements", "block"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"Config.{name}: {value!r} is not a whole number of at least 1")
+        threshold = self.resample_threshold
+        if not isinstance(threshold, (int, float)) or not 0 <= threshold < math.inf:
+            raise ValueError(f"Config.resample_threshold: {threshold!r} is not a number >= 0")
+        if self.forgetting is None:
+            object.__setattr__(self, "forgetting", self.association != "known")
+        for name in ("exclusive", "clutter", "forgetting"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"Config.{name}: {getattr(self, name)!r} is not true or false")
+
+    @classmethod
+    def paper(cls, particles=1000, landmarks=64, measurements=16, **changes):
+        """The paper's own rules: 2-D positions, prior proposal, best match for every measurement.
+
+        Nothing is exclusive, nothing is clutter and nothing is forgotten (paper, section III-D).
+        """
+        rules = dict(sensor="position", exclusive=False, clutter=False, forgetting=False)
+        return cls(
+            particles=particles,
+            landmarks=landmarks,
+            measurements=measurements,
+            **(rules | changes),
+        )
+
+
+class Params(NamedTuple):
+    """The filter's numbers, each a float or a 0-d array; `UNITS` has their units.
+
+    Motion noise grows with what was driven: variance `err_tran**2` per metre, `err_rot**2` per
+    radian turned, `err_drift**2` rad^2 per metre, and the floors per second. Gains are true over
+    measured odometry. The bearing's variance is `sigma_bearing**2 + (growth / range)**2`: a tube or
+    a door edge has a size. `view_*` is what the sensor can see and is declared by the log.
+    """
+
+    err_tran: float
+    err_rot: float
+    err_drift: float
+    floor_tran: float
+    floor_rot: float
+    gain_tran: float
+    gain_rot: float
+    bias_drift: float
+    sigma_range: float
+    sigma_bearing: float
+    growth: float
+    position_scale: float
+    mount_x: float
+    mount_y: float
+    mount_yaw: float
+    outlier: float
+    density_new: float
+    detection: float
+    view_min: float
+    view_max: float
+    view_range: float
+    inv_depth_mean: float
+    inv_depth_sd: float
+    existence_new: float
+    existence_seen: float
+    existence_miss: float
+    existence_max: float
+    existence_confirm: float
+
+
+UNITS = {
+    "err_tran": "m/sqrt(m)",
+    "err_rot": "rad/sqrt(rad)",
+    "err_drift": "rad/sqrt(m)",
+    "floor_tran": "m/sqrt(s)",
+    "floor_rot": "rad/sqrt(s)",
+    "gain_tran": "true / measured",
+    "gain_rot": "true / measured",
+    "bias_drift": "rad/m",
+    "sigma_range": "m",
+    "sigma_bearing": "rad",
+    "growth": "m",
+    "position_scale": "factor",
+    "mount_x": "m",
+    "mount_y": "m",
+    "mount_yaw": "rad",
+    "outlier": "probability",
+    "density_new": "1/m^2",
+    "detection": "probability",
+    "view_min": "rad",
+    "view_max": "rad",
+    "view_range": "m",
+    "inv_depth_mean": "1/m",
+    "inv_depth_sd": "1/m",
+    "existence_new": "log-odds",
+    "existence_seen": "log-odds per frame",
+    "existence_miss": "factor",
+    "existence_max": "log-odds",
+    "existence_confirm": "log-odds",
+}
+
+# Wide enough for a real robot's errors, which are correlated from frame to frame.
+_DEFAULTS = Params(
+    err_tran=0.05,
+    err_rot=0.05,
+    err_drift=0.05,
+    floor_tran=0.002,
+    floor_rot=0.005,
+    gain_tran=1.0,
+    gain_rot=1.0,
+    bias_drift=0.0,
+    sigma_range=0.1,
+    sigma_bearing=0.03,
+    growth=0.04,
+    position_scale=1.0,
+    mount_x=0.0,
+    mount_y=0.0,
+    mount_yaw=0.0,
+    outlier=0.01,
+    density_new=1e-3,
+    detection=0.9,
+    view_min=-math.pi,
+    view_max=math.pi,
+    view_range=10.0,
+    inv_depth_mean=0.5,
+    inv_depth_sd=0.5,
+    existence_new=1.0,
+    existence_seen=0.5,
+    existence_miss=0.1,
+    existence_max=20.0,
+    existence_confirm=5.0,
+)
+
+
+def default_params(sensor="range_bearing", log=None):
+    """Default `Params` of a sensor, with what the log declares: mounting, view and noise."""
+    if sensor not in SENSORS:
+        raise ValueError(f"sensor: {sensor!r} is not one of {', '.join(SENSORS)}")
+    params = _DEFAULTS
+    if log is None:
+        return params
+    names = ("mount_x", "mount_y", "mount_yaw", "view_min", "view_max", "view_range")
+    params = params._replace(**dict(zip(names, (*log.mounting, *log.view), strict=True)))
+    return params._replace(**log.noise)

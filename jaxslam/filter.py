@@ -1,0 +1,260 @@
+"""FastSLAM 1.0 with many measurements per step (paper, section III-D), vectorised.
+
+Each of N particles carries a pose and M landmark EKFs (eq. 6). A step moves the particles (eqs. 2
+and 4), associates, weighs and updates with every measurement of the frame (eqs. 3 and 5), and
+resamples. All arrays have fixed sizes and the particles last; `step` and `run` are pure and jitted.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import association, landmarks, motion, resampling, sensors
+from jaxslam.association import CLUTTER, NEW
+from jaxslam.geometry import wrap
+from jaxslam.landmarks import Landmarks
+
+
+class State(NamedTuple):
+    """What the next step needs: `pose` [3, N] (x, y, heading), the map, log weights [N], `step`."""
+
+    pose: jax.Array
+    landmarks: Landmarks
+    log_weight: jax.Array
+    step: jax.Array
+
+
+class Estimate(NamedTuple):
+    """Mean pose [3], its covariance [3, 3], and the particle of greatest weight."""
+
+    mean: jax.Array
+    cov: jax.Array
+    best: jax.Array
+
+
+class Info(NamedTuple):
+    """What is known about one step; counts are over all particles.
+
+    `match` [K, N]: slot matched, or -1 new, -2 clutter, -3 padding. `label` [K]: the best
+    particle's matches as births (`Landmarks.birth`). `ancestors` [N]. `new`: landmarks that the
+    best particle began. `overflow`: landmarks lost for want of a slot. `nonfinite`: particles whose
+    weight became NaN or infinite. `degenerate`: no weight was left, all were made equal.
+    """
+
+    estimate: Estimate
+    ess: jax.Array
+    log_evidence: jax.Array
+    resampled: jax.Array
+    ancestors: jax.Array
+    match: jax.Array
+    label: jax.Array
+    new: jax.Array
+    outliers: jax.Array
+    overflow: jax.Array
+    forgotten: jax.Array
+    nonfinite: jax.Array
+    degenerate: jax.Array
+
+
+def init(config, key, pose=(0.0, 0.0, 0.0), cov=None, landmarks_given=None):
+    """`State` before the first step: poses drawn from N(pose, cov), map empty or given.
+
+    `pose` (x, y, heading), `cov` [3, 3] (None: known exactly). `landmarks_given`: mean [2, L] and
+    factor [3, L] of a map that all particles share (for `bearing` also anchor [2, L]), as a tuple.
+    """
+    n = config.particles
+    pose = jnp.asarray(pose, float)
+    root = jnp.zeros((3, 3)) if cov is None else square_root(jnp.asarray(cov, float))
+    drawn = pose[:, None] + root @ start_draws(key, config).astype(pose.dtype)
+    world = landmarks.empty(config, pose.dtype)
+    if landmarks_given is not None:
+        world = landmarks.fill(world, landmarks_given)
+    return State(
+        pose=drawn.at[2].set(wrap(drawn[2])),
+        landmarks=world,
+        log_weight=jnp.full(n, -jnp.log(n), pose.dtype),
+        step=jnp.zeros((), jnp.int32),
+    )
+
+
+def square_root(cov):
+    """A square root of a covariance: Cholesky's, or the symmetric eigenvectors' if singular."""
+    factor = jnp.linalg.cholesky(cov)
+    values, vectors = jnp.linalg.eigh(cov)
+    return jnp.where(jnp.isfinite(factor).all(), factor, vectors * jnp.sqrt(jnp.maximum(values, 0)))
+
+
+def start_draws(key, config):
+    """Standard normals [3, N] behind the start poses."""
+    return jax.random.normal(jax.random.fold_in(key, 2**31 - 1), (3, config.particles), float)
+
+
+def draws(key, step, config):
+    """Standard normals [3, N] and the uniform behind a step, set by its absolute number alone."""
+    move, choose = jax.random.split(jax.random.fold_in(key, step))
+    normals = jax.random.normal(move, (3, config.particles), float)
+    return normals, jax.random.uniform(choose, (), float)
+
+
+@partial(jax.jit, static_argnames="config")
+def step(key, state, odometry, measurements, params, config):
+    """One step: move, associate and weigh, update, resample. Returns (State, Info)."""
+    normals, uniform = draws(key, state.step, config)
+    pose = jnp.stack(motion.sample(state.pose, odometry, params, normals))
+    world, density, match, counts = _observe(
+        pose, state.landmarks, measurements, params, config, state.step
+    )
+    log_weight, log_evidence, flags = _weigh(state.log_weight, density)
+    weight = jnp.exp(log_weight)
+    estimate = _estimate(pose, weight)
+    ess = 1 / jnp.sum(weight**2)
+    threshold = config.resample_threshold
+    wanted = measurements.active & ((ess < threshold * config.particles) | (threshold >= 1))
+    moved = State(pose, world, log_weight, state.step + 1)
+    resampled, ancestors = _resample(moved, wanted, uniform, config)
+    best_match, best_birth = match[:, estimate.best], world.birth[:, estimate.best]
+    label = jnp.where(best_match >= 0, best_birth[jnp.maximum(best_match, 0)], best_match)
+    info = Info(
+        estimate=estimate,
+        ess=ess,
+        log_evidence=log_evidence,
+        resampled=wanted,
+        ancestors=ancestors,
+        match=match,
+        label=label,
+        new=jnp.sum(best_match == NEW),
+        outliers=jnp.sum(match == CLUTTER),
+        overflow=counts[0].sum(),
+        forgotten=counts[1].sum(),
+        nonfinite=flags[0],
+        degenerate=flags[1],
+    )
+    return resampled, info
+
+
+@partial(jax.jit, static_argnames=("config", "summarise"))
+def run(key, state, odometry, measurements, params, config, summarise=lambda info: info):
+    """Steps over T frames in one scan; `summarise` says what of each `Info` is kept and stacked."""
+
+    def body(state, frame):
+        state, info = step(key, state, *frame, params, config)
+        return state, summarise(info)
+
+    return jax.lax.scan(body, state, (odometry, measurements))
+
+
+def _observe(pose, world, measurements, params, config, number):
+    """Associate, weigh and update, block by block so that a block's temporaries stay in cache.
+
+    Returns the map, log densities [N], matches [K, N], and counts [2, N]: overflow, forgotten.
+    """
+    n = config.particles
+    size = _block_size(config)
+    # Outside the loop: XLA would work out cosine and sine again for every landmark.
+    sensor_pose = sensors.pose_of(tuple(pose), params)
+    carry = (world, *_nothing(config, n, pose.dtype))
+
+    def block(i, carry):
+        start = i * size
+        poses, mine = jax.tree.map(
+            lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, size, -1),
+            (sensor_pose, carry[0]),
+        )
+        # Inside a branch the slices are arrays of their own. Fused into the arithmetic, in-place
+        # reading and writing of the large arrays stops its vectorisation: ten times slower.
+        done = jax.lax.cond(
+            measurements.active,
+            lambda poses, mine: _observe_block(poses, mine, measurements, params, config, number),
+            lambda poses, mine: (mine, *_nothing(config, size, pose.dtype)),
+            poses,
+            mine,
+        )
+        return jax.tree.map(
+            lambda all_, new: jax.lax.dynamic_update_slice_in_dim(all_, new, start, -1), carry, done
+        )
+
+    return jax.lax.fori_loop(0, n // size, block, carry)
+
+
+def _nothing(config, size, dtype):
+    """What a frame without a look adds: log densities, matches, counts."""
+    match = jnp.full((config.measurements, size), association.PADDING, jnp.int32)
+    return jnp.zeros(size, dtype), match, jnp.zeros((2, size), jnp.int32)
+
+
+def _block_size(config):
+    """The largest divisor of the number of particles that is no larger than the block."""
+    n = config.particles
+    return next(size for size in range(min(config.block, n), 0, -1) if n % size == 0)
+
+
+def _observe_block(sensor_pose, before, measurements, params, config, step_number):
+    """The frame's measurements on one block of particles, as `_observe`."""
+    parts = tuple(before.anchor) if before.anchor is not None else None
+    seen = sensors.observe(config.sensor, sensor_pose, tuple(before.mean), parts, params)
+    if not config.clutter:
+        params = params._replace(outlier=jnp.zeros(()))
+    scorer = landmarks.scorer(config.sensor, seen, before, jnp.log1p(-params.outlier))
+    new = sensors.log_new_density(config.sensor, tuple(measurements.value.T), params)
+    clutter = sensors.log_clutter_density(config.sensor, params)
+    match = association.associate(config, scorer, measurements, new, clutter, params)
+    world, density = landmarks.update_matched(
+        config.sensor, sensor_pose, before, match, measurements, params
+    )
+    density = density + jnp.where(match == NEW, new[:, None], 0).sum(0)
+    if config.clutter:
+        density = density + jnp.where(match == CLUTTER, clutter, 0).sum(0)
+    world, overflow = landmarks.create(
+        config, sensor_pose, world, match, measurements, params, step_number
+    )
+    forgotten = jnp.zeros_like(overflow)
+    if config.forgetting:
+        world, forgotten = landmarks.existence(world, seen, params)
+    return (
+        landmarks.settle(world),
+        density,
+        match,
+        jnp.stack([overflow, forgotten]).astype(jnp.int32),
+    )
+
+
+def _weigh(log_weight, density):
+    """Normalised log weights, log evidence of the step, and flags (non-finite, degenerate)."""
+    raw = log_weight + density
+    finite = jnp.isfinite(raw)
+    # A particle that already had no weight is not news.
+    nonfinite = jnp.sum(~finite & (log_weight > -jnp.inf))
+    degenerate = ~finite.any()
+    log_evidence = jax.nn.logsumexp(jnp.where(finite, raw, -jnp.inf))
+    even = jnp.full_like(raw, -jnp.log(len(raw)))
+    normalised = jnp.where(finite, raw - log_evidence, -jnp.inf)
+    return jnp.where(degenerate, even, normalised), log_evidence, (nonfinite, degenerate)
+
+
+def _estimate(pose, weight):
+    """Weighted mean (circular in heading) and covariance of the poses, and the heaviest one."""
+    x, y, heading = pose
+    mean = jnp.stack(
+        [
+            weight @ x,
+            weight @ y,
+            jnp.arctan2(weight @ jnp.sin(heading), weight @ jnp.cos(heading)),
+        ]
+    )
+    off = jnp.stack([x - mean[0], y - mean[1], wrap(heading - mean[2])])
+    return Estimate(mean, (off * weight) @ off.T, jnp.argmax(weight))
+
+
+def _resample(state, wanted, uniform, config):
+    """Systematic resampling of poses and maps where wanted; also the ancestors."""
+    n = config.particles
+    same = jnp.arange(n, dtype=jnp.int32)
+    if config.resample_threshold == 0:
+        return state, same
+
+    ancestors = jnp.where(wanted, resampling.systematic(state.log_weight, uniform), same)
+    pose, world = resampling.gather((state.pose, state.landmarks), ancestors, wanted)
+    log_weight = jnp.where(wanted, -jnp.log(n), state.log_weight)
+    return State(pose, world, log_weight, state.step), ancestors

@@ -1,0 +1,316 @@
+"""The map of a particle: score measurements, update, create, forget.
+
+Arrays carry the particles last ([2, M, N] and so on, M slots): rows of many particles are
+contiguous, and every function below works on all of them at once.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import geometry, sensors
+from jaxslam.geometry import wrap
+
+
+class Landmarks(NamedTuple):
+    """M landmark slots of N particles. A slot is occupied while its `count` is positive.
+
+    `mean` [2, M, N], `factor` [3, M, N]: lower factor (l11, l21, l22), `anchor` [2, M, N] or None
+    (see `sensors`), `log_odds` [M, N] of existence or None, `count` [M, N]: times seen,
+    `birth` [M, N]: frame * K + k of the measurement that created it.
+    """
+
+    mean: jax.Array
+    factor: jax.Array
+    anchor: jax.Array | None
+    log_odds: jax.Array | None
+    count: jax.Array
+    birth: jax.Array
+
+
+class Scorer(NamedTuple):
+    """What scoring needs of every landmark, computed once a frame: predicted value, inverse
+    innovation covariance (for `position`: the covariance without R) and log normaliser; [M, N]."""
+
+    value: tuple
+    matrix: tuple
+    constant: jax.Array
+
+
+def empty(config, dtype):
+    """No landmarks."""
+    shape = (config.landmarks, config.particles)
+    return Landmarks(
+        mean=jnp.zeros((2, *shape), dtype),
+        factor=jnp.zeros((3, *shape), dtype),
+        anchor=jnp.zeros((2, *shape), dtype) if config.sensor == "bearing" else None,
+        log_odds=jnp.zeros(shape, dtype) if config.forgetting else None,
+        count=jnp.zeros(shape, jnp.int32),
+        birth=jnp.zeros(shape, jnp.int32),
+    )
+
+
+def scorer(sensor, seen, landmarks, inlier):
+    """`Scorer` of every slot; empty slots score -inf. `inlier`: log probability added to all."""
+    factor = tuple(landmarks.factor)
+    occupied = landmarks.count > 0
+    spread = [geometry.transpose_times(factor, row) for row in seen.rows]
+    s00 = spread[0][0] ** 2 + spread[0][1] ** 2
+    if sensor == "bearing":
+        s00 = jnp.where(occupied, s00 + seen.noise[0], 1.0)
+        constant = -0.5 * (jnp.log(s00) + sensors.LOG_2PI)
+        return Scorer(seen.value, (-0.5 / s00,), jnp.where(occupied, inlier + constant, -jnp.inf))
+    s01 = spread[0][0] * spread[1][0] + spread[0][1] * spread[1][1]
+    s11 = spread[1][0] ** 2 + spread[1][1] ** 2
+    if sensor == "position":
+        constant = jnp.where(occupied, inlier - sensors.LOG_2PI, -jnp.inf)
+        return Scorer(seen.value, (s00, s01, s11), constant)
+    s00, s11 = s00 + seen.noise[0], s11 + seen.noise[1]
+    det = jnp.where(occupied, s00 * s11 - s01 * s01, 1.0)
+    constant = jnp.where(occupied, inlier - sensors.LOG_2PI - 0.5 * jnp.log(det), -jnp.inf)
+    return Scorer(seen.value, (-0.5 * s11 / det, s01 / det, -0.5 * s00 / det), constant)
+
+
+def score(sensor, scorer, value, cov, params):
+    """log density of a measurement under a landmark; everything broadcasts."""
+    if sensor == "bearing":
+        v0 = wrap(value[0] - scorer.value[0])
+        return scorer.constant + scorer.matrix[0] * v0 * v0
+    v0, v1 = value[0] - scorer.value[0], value[1] - scorer.value[1]
+    if sensor == "position":
+        scale = params.position_scale**2
+        s00, s01, s11 = (p + scale * c for p, c in zip(scorer.matrix, cov, strict=True))
+        det = s00 * s11 - s01 * s01
+        square = (v0 * v0 * s11 - 2 * v0 * v1 * s01 + v1 * v1 * s00) / det
+        return scorer.constant - 0.5 * (square + jnp.log(det))
+    v1 = wrap(v1)
+    a, b, c = scorer.matrix
+    return scorer.constant + v0 * (a * v0 + b * v1) + c * v1 * v1
+
+
+def update(sensor, sensor_pose, mean, factor, anchor, value, cov, params):
+    """One landmark's EKF update: mean, factor, log predictive density of the measurement.
+
+    A 2-D measurement is two whitened scalars, both linearised at the mean before the update, so
+    that the product of their densities is the joint one.
+    """
+    seen = sensors.observe(sensor, sensor_pose, mean, anchor, params)
+    if sensor == "bearing":
+        innovations = (wrap(value[0] - seen.value[0]),)
+        rows, variances = seen.rows, seen.noise
+    elif sensor == "position":
+        innovations, rows, variances = _whiten(seen, value, cov, params)
+    else:
+        innovations = (value[0] - seen.value[0], wrap(value[1] - seen.value[1]))
+        rows, variances = seen.rows, seen.noise
+    log_density, start = 0.0, mean
+    for row, innovation, variance in zip(rows, innovations, variances, strict=True):
+        moved = row[0] * (mean[0] - start[0]) + row[1] * (mean[1] - start[1])
+        rest = innovation - moved
+        mean, factor, s = geometry.scalar_update(mean, factor, row, rest, variance)
+        log_density -= 0.5 * (rest * rest / s + jnp.log(s) + sensors.LOG_2PI)
+    if sensor == "bearing":
+        mean = (mean[0], jnp.maximum(mean[1], sensors.LEAST_INVERSE_DEPTH))
+    return mean, factor, log_density
+
+
+def _whiten(seen, value, cov, params):
+    """Two independent scalars out of a position: the second with the first's share taken out."""
+    xx, xy, yy = (component * params.position_scale**2 for component in cov)
+    share = xy / xx
+    v0, v1 = value[0] - seen.value[0], value[1] - seen.value[1]
+    first, second = seen.rows
+    rest = (second[0] - share * first[0], second[1] - share * first[1])
+    return (v0, v1 - share * v0), (first, rest), (xx, yy - share * xy)
+
+
+def existence(world, seen, params):
+    """Log-odds after a frame: matched raises, expected and unseen lowers; below zero is freed.
+
+    `world` is the map after `update_matched`, with its marks; `seen` the prediction from before.
+    The chance of being seen falls linearly with range, to zero at the declared maximum.
+    """
+    expected = (
+        (seen.bearing >= params.view_min)
+        & (seen.bearing <= params.view_max)
+        & (seen.range < params.view_range)
+    )
+    chance = params.detection * jnp.maximum(0.0, 1 - seen.range / params.view_range)
+    raised = jnp.minimum(world.log_odds + params.existence_seen, params.existence_max)
+    lowered = world.log_odds + params.existence_miss * jnp.log1p(-chance)
+    missed = jnp.where((world.count > 0) & expected, lowered, world.log_odds)
+    log_odds = jnp.where(world.count < 0, raised, missed)
+    freed = (world.count != 0) & (log_odds < 0)
+    return world._replace(log_odds=log_odds, count=jnp.where(freed, 0, world.count)), freed.sum(0)
+
+
+def settle(world):
+    """The map with the frame's marks taken off."""
+    return world._replace(count=jnp.abs(world.count))
+
+
+def fill(world, given):
+    """The map with its first slots set to a given one: mean [2, L], factor [3, L] (, anchor)."""
+    parts = dict(zip(("mean", "factor", "anchor"), given, strict=False))
+    size = jnp.shape(parts["mean"])[1]
+    if size > world.count.shape[0]:
+        raise ValueError(f"{size} landmarks given, but the map has {world.count.shape[0]} slots")
+    world = world._replace(
+        count=world.count.at[:size].set(1),
+        birth=world.birth.at[:size].set(-jnp.arange(4, 4 + size, dtype=jnp.int32)[:, None]),
+        **{
+            name: getattr(world, name).at[:, :size].set(jnp.asarray(value)[:, :, None])
+            for name, value in parts.items()
+        },
+    )
+    return world
+
+
+def update_matched(sensor, sensor_pose, world, match, measurements, params):
+    """The map after the frame's matched measurements, in their order, and log densities [n].
+
+    Only the matched slots are read and written: gather, update, scatter. The count of a matched
+    slot comes back negative, as a mark for `existence` (to compare with the old counts instead
+    would keep the old map alive, and XLA would copy all of it for every block); `settle` ends it.
+    """
+    lane = jnp.arange(match.shape[1])
+    inlier = jnp.log1p(-params.outlier)
+
+    def one(k, carry):
+        mean, factor, count, density = carry
+        matched = match[k] >= 0
+        slot = jnp.where(matched, match[k], 0)
+        anchor = None if world.anchor is None else tuple(world.anchor[:, slot, lane])
+        new_mean, new_factor, log_density = update(
+            sensor,
+            sensor_pose,
+            tuple(mean[:, slot, lane]),
+            tuple(factor[:, slot, lane]),
+            anchor,
+            tuple(measurements.value[k]),
+            tuple(measurements.cov[k]),
+            params,
+        )
+        slot = jnp.where(matched, slot, mean.shape[1])  # out of range: dropped
+        mean = mean.at[:, slot, lane].set(jnp.stack(new_mean), mode="drop", unique_indices=True)
+        factor = factor.at[:, slot, lane].set(
+            jnp.stack(new_factor), mode="drop", unique_indices=True
+        )
+        seen_again = -1 - jnp.abs(count[jnp.minimum(slot, len(count) - 1), lane])
+        count = count.at[slot, lane].set(seen_again, mode="drop", unique_indices=True)
+        return mean, factor, count, density + jnp.where(matched, inlier + log_density, 0)
+
+    start = (world.mean, world.factor, world.count, jnp.zeros_like(sensor_pose[0]))
+    mean, factor, count, density = jax.lax.fori_loop(0, match.shape[0], one, start)
+    return world._replace(mean=mean, factor=factor, count=count), density
+
+
+def create(config, sensor_pose, world, match, measurements, params, step_number):
+    """The map with a landmark for every measurement matched as new, and the overflow [n].
+
+    With known identities identity i takes slot i, else the lowest free slot, in the measurements'
+    order. Births are rare: each round serves one of every particle that still has any.
+    """
+    total, slots = match.shape[0], jnp.arange(world.count.shape[0])[:, None]
+    index, lane = jnp.arange(total)[:, None], jnp.arange(match.shape[1])
+    value, cov = jnp.asarray(measurements.value).T, jnp.asarray(measurements.cov).T
+
+    def one(carry):
+        world, waiting, overflow = carry
+        k = jnp.where(waiting, index, total).min(0)
+        born = k < total
+        k = jnp.minimum(k, total - 1)
+        if config.association == "known":
+            slot = jnp.where(measurements.identity[k] >= 0, measurements.identity[k], len(slots))
+        else:
+            slot = jnp.where(world.count == 0, slots, len(slots)).min(0)
+        mean, factor, anchor = sensors.locate(
+            config.sensor, sensor_pose, tuple(v[k] for v in value), tuple(c[k] for c in cov), params
+        )
+        fresh = Landmarks(
+            mean=jnp.stack(mean),
+            factor=jnp.stack(factor),
+            anchor=None if world.anchor is None else jnp.stack(anchor),
+            # Marked as matched: `existence` will add what is taken off here.
+            log_odds=None
+            if world.log_odds is None
+            else params.existence_new - params.existence_seen,
+            count=-1,
+            birth=step_number * total + k,
+        )
+        target = jnp.where(born, slot, len(slots))  # out of range: dropped
+        world = jax.tree.map(
+            lambda old, new: old.at[..., target, lane].set(new, mode="drop", unique_indices=True),
+            world,
+            fresh,
+        )
+        lost = born & (slot >= len(slots))
+        return world, waiting & (index != k), overflow + lost
+
+    carry = (world, match == -1, jnp.zeros(match.shape[1], jnp.int32))
+    world, _, overflow = jax.lax.while_loop(lambda carry: carry[1].any(), one, carry)
+    return world, overflow
+
+
+class Table(NamedTuple):
+    """One map for all particles, M slots: world `mean` [2, M], `cov` [3, M], `count`, `birth`, and
+    whether the slot is `kept`: occupied, confirmed, and of known depth."""
+
+    mean: jax.Array
+    cov: jax.Array
+    count: jax.Array
+    birth: jax.Array
+    kept: jax.Array
+
+
+@partial(jax.jit, static_argnames="config")
+def summarise(world, weight, best, params, config):
+    """The map of particle `best`, each landmark averaged over the particles that share its birth.
+
+    The covariance is the mixture's: the mean of the particles' own, and the spread of their means.
+    """
+    mine = jax.tree.map(lambda leaf: leaf[..., best], world)
+    centre, _, depth_known = to_world(config.sensor, mine)
+    confirmed = True if mine.log_odds is None else mine.log_odds >= params.existence_confirm
+
+    def one(birth, centre):
+        share = weight * ((world.birth == birth) & (world.count > 0))
+        point, cov, known = to_world(config.sensor, world)
+        share = jnp.where(known, share, 0)
+        share = share / share.sum()
+        dx, dy = point[0] - centre[0], point[1] - centre[1]
+        mx, my = jnp.sum(share * jnp.where(known, dx, 0)), jnp.sum(share * jnp.where(known, dy, 0))
+        spread = ((dx - mx) ** 2, (dx - mx) * (dy - my), (dy - my) ** 2)
+        total = [jnp.sum(jnp.where(share > 0, share * (a + b), 0)) for a, b in zip(cov, spread)]
+        return jnp.stack([centre[0] + mx, centre[1] + my]), jnp.stack(total)
+
+    mean, cov = jax.lax.map(lambda args: one(*args), (mine.birth, jnp.stack(centre, -1)))
+    kept = (mine.count > 0) & confirmed & depth_known
+    return Table(mean.T, cov.T, mine.count, mine.birth, kept)
+
+
+def to_world(sensor, world):
+    """World point (x, y), covariance (xx, xy, yy) and whether its depth is known, of every slot.
+
+    An inverse depth counts as known when it is three standard deviations from zero.
+    """
+    if sensor != "bearing":
+        return (
+            tuple(world.mean),
+            geometry.covariance(world.factor),
+            jnp.full(world.count.shape, True),
+        )
+    (angle, depth), (pp, pd, dd) = world.mean, geometry.covariance(world.factor)
+    known = depth > 3 * jnp.sqrt(dd)
+    depth = jnp.where(known, depth, 1.0)
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    # Columns of the Jacobian: by direction, by inverse depth.
+    ax, ay, bx, by = -s / depth, c / depth, -c / depth**2, -s / depth**2
+    cov = (
+        ax * ax * pp + 2 * ax * bx * pd + bx * bx * dd,
+        ax * ay * pp + (ax * by + ay * bx) * pd + bx * by * dd,
+        ay * ay * pp + 2 * ay * by * pd + by * by * dd,
+    )
+    return (world.anchor[0] + c / depth, world.anchor[1] + s / depth), cov, known

@@ -1,0 +1,116 @@
+"""p(pose' | pose, odometry): the paper's translation, then rotation (section III-C, fig. 9).
+
+The heading drifts while the robot translates (`err_drift`), then it rotates (`err_rot`). An
+interval of many small steps keeps the direction of its chord, and its covariance is that of the
+many steps: heading noise that arose early displaces the end sideways, by the lever that was left.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.geometry import wrap
+
+
+class Odometry(NamedTuple):
+    """What the odometry says of one interval (or of T, stacked).
+
+    `dx, dy` [m] and `dtheta` [rad]: displacement in the robot's frame at the interval's start.
+    `distance` [m], `turn` [rad]: sums of absolute values. `duration` [s]. `lever`: mean fraction of
+    the path still ahead when the robot turned (0 for translate-then-rotate, 1/2 for an arc);
+    `lever_var`: its variance over the turning (0, 1/12).
+    """
+
+    dx: jax.Array
+    dy: jax.Array
+    dtheta: jax.Array
+    distance: jax.Array
+    turn: jax.Array
+    duration: jax.Array
+    lever: jax.Array
+    lever_var: jax.Array
+
+
+class Motion(NamedTuple):
+    """The model of one interval: chord (length, direction), turn, and the noise in its frame.
+
+    The noise is normal: `var_along` the chord; `var_heading`; and sideways `slope` times the
+    heading's noise, plus `var_rest` of its own.
+    """
+
+    length: jax.Array
+    chord: jax.Array
+    turn: jax.Array
+    var_along: jax.Array
+    var_heading: jax.Array
+    slope: jax.Array
+    var_rest: jax.Array
+
+
+def model(odometry, params):
+    """`Motion` of one interval, with the systematic gains applied.
+
+    Drift accrues evenly along the chord, so its lever has mean 1/2 and variance 1/12; turning noise
+    has the odometry's. Sideways noise is lever x length x heading noise: the two kinds together
+    have slope cov(side, heading) / var(heading), and what is left of the variance is written as a
+    sum, which can't cancel below zero.
+    """
+    o = odometry
+    moved = (o.dx != 0) | (o.dy != 0)
+    raw_length = jnp.where(moved, jnp.hypot(jnp.where(moved, o.dx, 1.0), o.dy), 0.0)
+    raw_chord = jnp.where(moved, jnp.arctan2(o.dy, jnp.where(moved, o.dx, 1.0)), 0.0)
+    length = params.gain_tran * raw_length
+    # Extra turning bends the path: the chord follows by the share that happened before its end.
+    bend = o.lever * (params.gain_rot - 1) * o.dtheta + params.bias_drift * o.distance / 2
+    floor_side = params.floor_tran**2 * o.duration
+    var_drift = params.err_drift**2 * o.distance + params.floor_rot**2 * o.duration
+    var_turn = params.err_rot**2 * o.turn
+    var_heading = var_drift + var_turn
+    turning = var_heading > 0
+    per_heading = jnp.where(turning, 1 / jnp.where(turning, var_heading, 1.0), 0.0)
+    between = var_drift * var_turn * (o.lever - 0.5) ** 2 * per_heading
+    return Motion(
+        length=length,
+        chord=raw_chord + bend,
+        turn=params.gain_rot * o.dtheta + params.bias_drift * o.distance,
+        var_along=params.err_tran**2 * o.distance + floor_side,
+        var_heading=var_heading,
+        slope=length * (var_drift / 2 + o.lever * var_turn) * per_heading,
+        var_rest=length**2 * (var_drift / 12 + o.lever_var * var_turn + between) + floor_side,
+    )
+
+
+def sample(pose, odometry, params, normals):
+    """Pose after the interval for standard normal draws `normals` (3,); poses (x, y, heading)."""
+    m = model(odometry, params)
+    x, y, heading = pose
+    e_along = _root(m.var_along) * normals[0]
+    e_heading = _root(m.var_heading) * normals[1]
+    e_side = m.slope * e_heading + _root(m.var_rest) * normals[2]
+    c, s = jnp.cos(heading + m.chord), jnp.sin(heading + m.chord)
+    ahead = m.length + e_along
+    return (
+        x + c * ahead - s * e_side,
+        y + s * ahead + c * e_side,
+        wrap(heading + m.turn + e_heading),
+    )
+
+
+def log_density(after, before, odometry, params):
+    """log p(after | before, odometry) per m^2 rad; needs noise in every direction (the floors)."""
+    m = model(odometry, params)
+    c, s = jnp.cos(before[2] + m.chord), jnp.sin(before[2] + m.chord)
+    dx, dy = after[0] - before[0], after[1] - before[1]
+    e_along, e_side = c * dx + s * dy - m.length, c * dy - s * dx
+    e_heading = wrap(after[2] - before[2] - m.turn)
+    rest = e_side - m.slope * e_heading
+    squares = e_along**2 / m.var_along + e_heading**2 / m.var_heading + rest**2 / m.var_rest
+    logs = jnp.log(m.var_along) + jnp.log(m.var_heading) + jnp.log(m.var_rest)
+    return -0.5 * (squares + logs + 3 * jnp.log(2 * jnp.pi))
+
+
+def _root(variance):
+    """Square root with gradient zero at zero."""
+    positive = variance > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, variance, 1.0)), 0.0)

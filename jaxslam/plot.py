@@ -1,0 +1,298 @@
+"""The figures of a run: its map, its error over time, its particles. Drawn without pyplot's state.
+
+What is estimated is drawn as it is, not aligned to the truth, since the start pose is given.
+"""
+
+import os
+from pathlib import Path
+from secrets import token_hex
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import NullFormatter
+
+from jaxslam.evaluate import truth_at, with_truth, wrap
+
+FIGURES = ("map.png", "error.png", "particles.png")
+DPI = 150
+# Okabe and Ito's palette, told apart by the colour-blind too.
+TRUE, FILTER, RECKONING, LANDMARK, PLAN = "#222222", "#0072B2", "#E69F00", "#D55E00", "#9A9A9A"
+STYLE = {
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+    "svg.fonttype": "none",
+}
+
+
+def plot(result, directory):
+    """Write map.png, error.png and particles.png of a result into a folder; returns their paths.
+
+    Raises `ValueError` if they can't be written.
+    """
+    directory = Path(directory)
+    paths = []
+    for name, draw in zip(FIGURES, (draw_map, draw_error, draw_particles), strict=True):
+        with matplotlib.rc_context(STYLE):
+            figure = draw(result)
+            paths.append(_write(figure, directory / name))
+    return paths
+
+
+def plot_folder(directory, log=None):
+    """Draw the figures of a saved run anew; `log`: where its log is, if it was moved."""
+    from jaxslam.report import load  # here, since the report draws
+
+    return plot(load(directory, log), directory)
+
+
+def ellipses(mean, cov, sigmas=3.0, corners=49):
+    """Outlines [L, corners, 2] of the ellipses of covariances [L, 3] (xx, xy, yy) about [L, 2]."""
+    xx, xy, yy = np.asarray(cov, float).reshape(-1, 3).T
+    value, vector = np.linalg.eigh(np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2))
+    half = vector * np.sqrt(value.clip(0))[:, None, :]
+    angle = np.linspace(0, 2 * np.pi, corners)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    return np.asarray(mean)[:, None] + sigmas * (half @ circle).transpose(0, 2, 1)
+
+
+def draw_map(result):
+    """Figure: paths and landmarks with 3-sigma ellipses, over the plan or a box about the truth."""
+    log, true = result.log, truth_at(result.log.truth, result.time)
+    low, high, core = _limits(result, true)
+    width, height = high - low
+    size = np.array([width, height]) * min(9.5 / width, 7.5 / height)
+    figure = Figure(figsize=(max(size[0], 5) + 0.9, size[1] + 1.9), layout="constrained")
+    axes = figure.add_subplot()
+    _draw_plan(axes, log, core)
+    if with_truth(true).any():
+        _curve(axes, *true[:, :2].T, TRUE, label="true path")
+    reckoning = result.dead_reckoning
+    axes.plot(*reckoning[:, :2].T, "--", color=RECKONING, lw=0.7, label="dead reckoning", zorder=1)
+    axes.plot(*result.pose[:, :2].T, color=FILTER, lw=1.0, alpha=0.85, label="filter", zorder=3)
+    axes.plot(*log.start_pose[:2], "D", ms=6, mec="white", color=FILTER, label="start", zorder=6)
+    if log.truth is not None and log.truth.landmarks is not None:
+        axes.plot(
+            *log.truth.landmarks.T, "o", ms=9, mfc="none", mec=TRUE, label="true landmark", zorder=4
+        )
+    outside = _draw_landmarks(axes, result.landmarks, low, high)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
+    axes.set_aspect("equal")
+    axes.set_title(_title(result, true, outside))
+    figure.legend(
+        *axes.get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=7 if figure.get_figwidth() > 9 else 4,
+    )
+    return figure
+
+
+def _draw_landmarks(axes, landmarks, low, high):
+    """Draw the estimated ones; returns how many lie outside the picture."""
+    mean, cov = np.reshape(landmarks.mean, (-1, 2)), np.reshape(landmarks.cov, (-1, 3))
+    drawable = np.isfinite(mean).all(1) & np.isfinite(cov).all(1)
+    mean, cov = mean[drawable], cov[drawable]
+    if len(mean) == 0:
+        return 0
+    halo = [withStroke(linewidth=3.6, foreground="white")]
+    (plus,) = axes.plot(*mean.T, "+", ms=8, mew=1.8, color=LANDMARK, label="landmark", zorder=5)
+    plus.set_path_effects(halo)
+    outlines = LineCollection(
+        ellipses(mean, cov), colors=LANDMARK, linewidths=0.9, zorder=5, label="its 3σ"
+    )
+    axes.add_collection(outlines, autolim=False)
+    return int(((mean < low) | (mean > high)).any(1).sum())
+
+
+def _draw_plan(axes, log, core):
+    """The floor plan; without one, the box about the truth (or the estimate)."""
+    plan = log.plan
+    if plan is not None and plan.image is not None:
+        height, width = plan.image.shape
+        (x, y), scale = plan.origin, plan.scale
+        extent = (x, x + width * scale, y, y + height * scale)
+        axes.imshow(plan.image, cmap="gray", vmin=0, vmax=255, alpha=0.5, extent=extent, zorder=0)
+    if plan is not None and plan.segments is not None:
+        walls = plan.segments.reshape(-1, 2, 2)
+        axes.add_collection(LineCollection(walls, colors=PLAN, linewidths=2.2, zorder=0))
+    if plan is None:
+        (x, y), (right, top) = core
+        axes.fill([x, right, right, x], [y, y, top, top], color="#F4F4F1", zorder=0)
+
+
+def _limits(result, true):
+    """The picture's corners low, high and those of what it is about.
+
+    It shows plan, paths and true landmarks; of dead reckoning and of estimated landmarks, which may
+    be anywhere, only what lies within a third of that beyond it.
+    """
+    plan, truth = result.log.plan, result.log.truth
+    points = [true[with_truth(true), :2], result.pose[:, :2], result.log.start_pose[None, :2]]
+    if plan is not None and plan.segments is not None:
+        points.append(plan.segments.reshape(-1, 2))
+    if plan is not None and plan.image is not None:
+        size = np.array(plan.image.shape[::-1]) * plan.scale
+        points.append(np.array([plan.origin, plan.origin + size]))
+    if truth is not None and truth.landmarks is not None:
+        points.append(truth.landmarks)
+    points = np.concatenate(points)
+    points = points[np.isfinite(points).all(1)]
+    core = low, high = points.min(0), points.max(0)
+    beyond = max((high - low).max() / 3, 0.5)
+    loose = np.concatenate(
+        [result.dead_reckoning[:, :2], np.reshape(result.landmarks.mean, (-1, 2))]
+    )
+    loose = loose[((loose >= low - beyond) & (loose <= high + beyond)).all(1)]
+    every = np.concatenate([loose, low[None], high[None]])
+    pad = 0.04 * (every.max(0) - every.min(0)).max() + 0.1
+    return every.min(0) - pad, every.max(0) + pad, core
+
+
+def _title(result, true, outside):
+    config = result.config
+    about = f"{config.sensor}, {config.association}".replace("_", " ")
+    have = with_truth(true)
+    told = "no true path"
+    if have.any():
+        error = np.hypot(*(result.pose - true)[have, :2].T)
+        told = f"path error {np.sqrt(np.mean(error**2)):.2f} m RMSE"
+    count = f"{len(result.landmarks.mean)} landmarks"
+    count += f" ({outside} outside the picture)" if outside else ""
+    return (
+        f"{result.log.name}: {about}, {config.particles:,} particles\n{told}, not aligned; {count}"
+    )
+
+
+def draw_error(result):
+    """Figure over time: position and heading error within the filter's own 3 sigma, and drift."""
+    figure = Figure(figsize=(9.5, 7.5), layout="constrained")
+    position, heading, drift = figure.subplots(3, 1, sharex=True, height_ratios=(1.25, 1, 1))
+    seconds, true = _seconds(result), truth_at(result.log.truth, result.time)
+    known = with_truth(true).any()
+    error = np.hypot(*(result.pose - true)[:, :2].T)
+    turned = np.degrees(wrap(result.pose - true)[:, 2])
+    xx, xy, yy = result.cov[:, (0, 0, 1), (0, 1, 1)].T
+    largest = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)  # variance, in the worst direction
+    for axes, low, band in (
+        (position, 0, 3 * np.sqrt(largest.clip(0))),
+        (heading, -1, 3 * np.degrees(np.sqrt(result.cov[:, 2, 2].clip(0)))),
+    ):
+        fill = axes.fill_between(seconds, low * band, band, color=FILTER, alpha=0.22, lw=0)
+    fill.set_label("filter's own 3σ")
+    _curve(position, seconds, error, FILTER, label="filter")
+    _curve(heading, seconds, turned, FILTER)
+    _curve(drift, seconds, error, FILTER)
+    reference = true if known else result.pose
+    reckoning = np.hypot(*(result.dead_reckoning - reference)[:, :2].T)
+    _curve(drift, seconds, reckoning, RECKONING, "--", "dead reckoning")
+    about = "errors, not aligned; gaps: no truth" if known else "no truth in the log: 3σ alone"
+    position.set(title=f"{result.log.name}: {about}", ylabel="position error [m]", ylim=(0, None))
+    heading.set(ylabel="heading error [°]")
+    about = "beside dead reckoning" if known else "dead reckoning, measured from the filter"
+    measure = "position error" if known else "distance"
+    drift.set(title=about, ylabel=f"{measure} [m]", ylim=(0, None))
+    _time_axis(drift, seconds)
+    figure.align_ylabels()
+    figure.legend(loc="outside lower center", ncols=3)
+    return figure
+
+
+def _curve(axes, x, y, colour, style="-", label=None):
+    """A line; values that have no finite neighbour, which a line can't show, are dots."""
+    known = np.pad(np.isfinite(y), 1)
+    alone = known[1:-1] & ~known[:-2] & ~known[2:]
+    axes.plot(x, y, style, color=colour, lw=1.1, label=label)
+    axes.plot(x[alone], y[alone], ".", color=colour, ms=4)
+
+
+def draw_particles(result):
+    """Figure over time: effective sample size and resampling, landmarks made and freed, clutter."""
+    figure = Figure(figsize=(9.5, 7.0), layout="constrained")
+    sample, landmarks, clutter = figure.subplots(3, 1, sharex=True, height_ratios=(1.5, 1, 1))
+    seconds = _seconds(result)
+    _draw_sample_size(sample, result, seconds)
+    for name, label, colour in (
+        ("new", "created, best particle", FILTER),
+        ("forgotten", "forgotten, mean of particles", LANDMARK),
+        ("overflow", "lost: map full, mean of particles", TRUE),
+    ):
+        count = np.cumsum(np.asarray(getattr(result, name), float))
+        if name != "overflow" or count[-1:] > 0:
+            landmarks.step(seconds, count, where="post", color=colour, lw=1.4, label=label)
+    landmarks.set(ylabel="landmarks, in sum", ylim=(0, None))
+    seen = (np.asarray(result.row) >= 0).sum(1)
+    edges, (measured, rejected) = _binned(seconds, seen, result.outliers)
+    clutter.stairs(measured, edges, color=PLAN, fill=True, alpha=0.6, label="measurements")
+    clutter.stairs(rejected, edges, color=LANDMARK, fill=True, label="called clutter")
+    clutter.set(ylabel="per frame", ylim=(0, None))
+    _time_axis(clutter, seconds)
+    for axes in (sample, landmarks, clutter):  # above the panel, where a legend hides nothing
+        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0.1)
+    figure.align_ylabels()
+    return figure
+
+
+def _draw_sample_size(axes, result, seconds):
+    """The effective sample size: its span and median in short stretches; resampling as a rug."""
+    config, ess = result.config, np.asarray(result.ess, float)
+    stretches = np.array_split(np.arange(ess.size), min(300, ess.size))
+    at = [seconds[stretch].mean() for stretch in stretches]
+    span = np.array([np.percentile(ess[stretch], (0, 50, 100)) for stretch in stretches]).T
+    axes.fill_between(at, span[0], span[2], color=FILTER, alpha=0.25, lw=0, label="least to most")
+    axes.plot(at, span[1], color=FILTER, lw=1.1, label="median")
+    threshold = config.resample_threshold * config.particles
+    if threshold > 0:
+        axes.axhline(threshold, color=LANDMARK, lw=1.2, ls="--", label="resampled below")
+    ticks = seconds[np.asarray(result.resampled, bool)]
+    rug = axes.vlines(ticks, 0, 0.04, colors=TRUE, lw=0.6, transform=axes.get_xaxis_transform())
+    rug.set_alpha(min(1.0, 300 / max(ticks.size, 1)))
+    least = max(0.8, np.nanmin(ess, initial=config.particles / 10) / 3)
+    axes.set(yscale="log", ylim=(least, config.particles * 1.3), ylabel="effective particles")
+    axes.yaxis.set_major_formatter("{x:,.0f}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.set_title(
+        f"{result.log.name}: {config.particles:,} particles, resampled {ticks.size:,} times"
+    )
+
+
+def _binned(seconds, *columns, bins=120):
+    """Edges and the means of columns [T] over equal spans of time; 0 where a span is empty."""
+    bins = min(bins, max(len(seconds), 1))
+    edges = np.linspace(0, max(seconds[-1:].max(initial=0), 1e-3), bins + 1)
+    count = np.histogram(seconds, edges)[0].clip(1)
+    return edges, [np.histogram(seconds, edges, weights=column)[0] / count for column in columns]
+
+
+def _seconds(result):
+    """Frame times [T] in seconds since the first frame."""
+    return (result.time - result.time[:1]) / 1e9
+
+
+def _time_axis(axes, seconds):
+    axes.set(xlabel="time [s]", xlim=(0, max(seconds[-1:].max(initial=0), 1e-3)))
+
+
+def _write(figure, path):
+    """Save a figure as PNG, whole or not at all."""
+    partial = path.with_name(f".{path.name}.{token_hex(4)}")
+    try:
+        FigureCanvasAgg(figure)
+        figure.savefig(partial, format="png", dpi=DPI, bbox_inches="tight", pad_inches=0.12)
+        os.replace(partial, path)
+    except OSError as error:
+        raise ValueError(f"{path}: can't be written ({error.strerror})") from error
+    finally:
+        partial.unlink(missing_ok=True)
+    return path

@@ -1,0 +1,361 @@
+"""A run's folder: written whole or not at all, and read back.
+
+`run.toml` reruns it, `summary.json` sums it up, `trajectory.tum` and `landmarks.csv` are for other
+tools, `events.jsonl` says when something happened, `steps.npz` holds every column of the result.
+"""
+
+import errno
+import json
+import os
+import shutil
+import tomllib
+from importlib.metadata import PackageNotFoundError, version
+from math import cos, isfinite, sin
+from numbers import Integral
+from pathlib import Path
+from platform import python_version
+from secrets import token_hex
+
+import numpy as np
+
+from jaxslam import plot
+from jaxslam.config import Config, Params
+from jaxslam.evaluate import errors
+from jaxslam.log import BUNDLED, load_log, save_log
+
+COLUMNS = (
+    *("time", "pose", "cov", "ess", "resampled", "new", "overflow", "outliers", "forgotten"),
+    *("log_evidence", "nonfinite", "degenerate", "match", "row", "dead_reckoning"),
+)
+NEEDED = ("run.toml", "summary.json", "steps.npz")  # without these it is no run's folder
+FILES = (*NEEDED, "trajectory.tum", "landmarks.csv", "events.jsonl", "log.npz", *plot.FIGURES)
+
+
+def save(result, directory, overwrite=False, log_source=None, figures=True):
+    """Write a run's folder; all of it appears at once, or nothing does. The figures come after.
+
+    `log_source`: the path or name the log was loaded from, for reruns; without one the log itself
+    is stored beside the results. Raises `ValueError` for a folder that exists (unless `overwrite`
+    and it is a run's folder) or that can't be written.
+    """
+    directory = Path(directory)
+    check_target(directory, overwrite)
+    target = directory.resolve()
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        partial = _beside(target)
+        partial.mkdir()
+    except OSError as error:
+        raise _unwritable(directory, error) from error
+    try:
+        _write_files(result, partial, _source(log_source, target))
+        _sync(*partial.iterdir(), partial)
+        _move_into_place(partial, target, overwrite)
+    except OSError as error:
+        if error.errno == errno.ENOSPC:
+            raise
+        raise _unwritable(directory, error) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    if figures:
+        plot.plot(result, directory)
+
+
+def check_target(directory, overwrite=False):
+    """Raise `ValueError` if a run's folder can't be written here; to be asked before a long run."""
+    directory = Path(directory)
+    try:
+        if directory.exists() or directory.is_symlink():
+            _check_existing(directory, overwrite)
+        parent = next(path for path in directory.resolve().parents if path.exists())
+        if not parent.is_dir() or not os.access(parent, os.W_OK):
+            raise ValueError(f"{directory}: can't be made in {parent}; choose another with --out")
+    except OSError as error:
+        raise _unwritable(directory, error) from error
+
+
+def _check_existing(directory, overwrite):
+    if not directory.is_dir():
+        raise ValueError(f"{directory}: is not a folder; choose another with --out")
+    if not overwrite:
+        raise ValueError(f"{directory}: exists; choose another folder or add --overwrite")
+    names = {path.name for path in directory.iterdir()}
+    if names and not names.issuperset(NEEDED):
+        raise ValueError(f"{directory}: is not a run's folder, so it is not overwritten")
+    if strange := sorted(names - set(FILES)):
+        raise ValueError(f"{directory}: holds {strange[0]}, not of a run, so it is not overwritten")
+
+
+def load(directory, log=None):
+    """The `Result` saved in a run's folder. `log`: where its log is now, if it was moved.
+
+    Raises `ValueError` if a file is missing or broken, or if the log isn't the run's.
+    """
+    from jaxslam.runner import Result  # here, since the runner's results save themselves
+
+    directory = Path(directory)
+    try:
+        told = tomllib.loads((directory / "run.toml").read_text(encoding="utf-8"))
+        config, params = Config(**told["config"]), Params(**told["params"])
+        summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
+        with np.load(directory / "steps.npz", allow_pickle=False) as steps:
+            columns = {name: steps[name] for name in COLUMNS}
+            landmarks = {name[4:]: steps[name] for name in steps.files if name.startswith("map_")}
+        seed, source = told["seed"], told["log"]
+        spent = {name: summary[name] for name in ("seconds", "compile_seconds", "dropped")}
+    except FileNotFoundError as error:
+        raise ValueError(
+            f"{directory}: no {Path(error.filename).name}; not a run's folder"
+        ) from None
+    except (OSError, KeyError, TypeError, ValueError, EOFError) as error:
+        raise ValueError(f"{directory}: a broken run's folder ({error}); run it again") from error
+    log = _find_log(directory, source) if log is None else load_log(log)
+    if not np.isin(columns["time"], log.frame_time).all():
+        raise ValueError(f"{directory}: {log.name} is not the log of this run (frame times differ)")
+    return Result(
+        log=log,
+        config=config,
+        params=params,
+        seed=seed,
+        landmarks=map_estimate(landmarks),
+        **columns,
+        **spent,
+    )
+
+
+def map_estimate(columns):
+    """The `MapEstimate` with these columns."""
+    from jaxslam.runner import MapEstimate
+
+    return MapEstimate(**columns)
+
+
+def evaluate_folder(directory, log=None):
+    """The errors of a saved run, computed anew from its columns and its log's truth."""
+    return errors(load(directory, log))
+
+
+def summarise(result):
+    """`summary.json` as a dict: sizes, times, evidence, warnings, versions and the errors."""
+    config = result.config
+    return {
+        "log": result.log.name,
+        "sensor": config.sensor,
+        "association": config.association,
+        "proposal": config.proposal,
+        "seed": result.seed,
+        "n_particles": config.particles,
+        "n_steps": len(result.time),
+        "n_measurements": int((np.asarray(result.row) >= 0).sum()),
+        "seconds": result.seconds,
+        "compile_seconds": result.compile_seconds,
+        "log_likelihood": float(result.log_likelihood),
+        "n_landmarks": len(result.landmarks.mean),
+        "min_ess": float(np.min(result.ess)) if len(result.ess) else None,
+        "overflow": float(np.sum(result.overflow)),
+        "dropped_measurements": int(sum(result.dropped.values())),
+        "dropped": dict(result.dropped),
+        "warnings": list(result.flags),
+        "versions": versions(),
+        **errors(result),
+    }
+
+
+def versions():
+    """Versions of what computed the run."""
+    found = {"python": python_version()}
+    for package in ("jaxslam", "jax", "numpy"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def tum_lines(time, pose):
+    """Lines `t x y z qx qy qz qw`: seconds exact to the nanosecond, metres, unit quaternion.
+
+    `time` int64 ns [T], `pose` [T, 3]. Digits only, since not every reader takes exponents.
+    """
+    for stamp, (x, y, heading) in zip(np.asarray(time).tolist(), pose, strict=True):
+        sign, (second, nano) = "-" * (stamp < 0), divmod(abs(stamp), 10**9)
+        turn = f"{sin(heading / 2):.9f} {cos(heading / 2):.9f}"
+        yield f"{sign}{second}.{nano:09d} {x:.9f} {y:.9f} 0 0 0 {turn}\n"
+
+
+def landmark_lines(landmarks):
+    """The lines of `landmarks.csv`; numbers with all their digits."""
+    yield "id,x,y,sxx,sxy,syy,n\n"
+    for who, mean, cov, n in zip(
+        landmarks.id, landmarks.mean, landmarks.cov, landmarks.n, strict=True
+    ):
+        numbers = ",".join(repr(float(value)) for value in (*mean, *cov))
+        yield f"{int(who)},{numbers},{int(n)}\n"
+
+
+def event_lines(result):
+    """One JSON line per frame in which something happened; `t` in seconds since the first frame."""
+    happened = result.resampled | (result.new > 0) | (result.overflow > 0) | result.degenerate
+    happened = happened | (result.nonfinite > 0) | (result.forgotten >= 0.5)
+    for step in np.flatnonzero(happened).tolist():
+        event = {"step": step, "t": int(result.time[step] - result.time[0]) / 1e9}
+        event["ess"] = round(float(result.ess[step]), 1)
+        for name in ("resampled", "degenerate"):
+            event |= {name: True} if getattr(result, name)[step] else {}
+        for name in ("new", "overflow", "nonfinite", "forgotten"):
+            count = float(getattr(result, name)[step])
+            event |= {name: round(count, 3)} if count else {}
+        yield _json(event) + "\n"
+
+
+def run_toml(result, log):
+    """The text of `run.toml`: what the run was told, every value resolved."""
+    lines = [
+        f"name = {_toml(result.log.name)}",
+        f"log = {_toml(log)}  # path (from this folder) or name",
+        f"seed = {_toml(result.seed)}",
+    ]
+    lines += ["", "[config]", *_toml_table(vars(result.config))]
+    lines += ["", "[params]  # SI units, radians", *_toml_table(result.params._asdict())]
+    return "\n".join(lines) + "\n"
+
+
+def error_table(summary):
+    """The errors of a summary as text for people: the filter's beside dead reckoning's."""
+    text = []
+    if "ate_filtered_unaligned_rmse_m" in summary:
+        head = ("", "aligned RMSE", "unaligned RMSE", "unaligned max", "at the end")
+        text.append(_row(head))
+        for name, prefix, end in (
+            ("path, filter", "ate_filtered", "filtered_end_m"),
+            ("path, dead reckoning", "dead_reckoning_ate", "dead_reckoning_end_m"),
+        ):
+            aligned = f"{prefix}_rmse_m" if prefix == "ate_filtered" else f"{prefix}_m"
+            keys = (aligned, f"{prefix}_unaligned_rmse_m", f"{prefix}_unaligned_max_m", end)
+            text.append(_row((name, *(_metres(summary, key) for key in keys))))
+    if "landmarks_unaligned_matched" in summary:
+        keys = ("landmark_filtered_rmse_m", "landmark_filtered_unaligned_rmse_m")
+        text.append(_row(("landmarks", *(_metres(summary, key) for key in keys))))
+        for kind, place in (("landmarks", "aligned: "), ("landmarks_unaligned", "unaligned: ")):
+            if f"{kind}_matched" in summary:
+                told = [f"{summary[f'{kind}_{k}']} {k}" for k in ("matched", "missed", "spurious")]
+                text.append(f"{place:>24}{', '.join(told)}")
+        gate = summary.get("landmark_gate_m")
+        text[-1] += f" (gate {gate:.2f} m)" if gate is not None else " (paired by identity)"
+    for key, label, scale, unit in (
+        ("heading_filtered_rmse_rad", "heading, filter", 180 / np.pi, "° RMSE, unaligned"),
+        ("rpe_1m_m", "per metre, filter", 1, " m"),
+        ("dead_reckoning_rpe_1m_m", "per metre, reckoning", 1, " m"),
+        ("association_accuracy", "association", 100, " % right"),
+        ("nees_median", "pose NEES, median", 1, " (2.37 if the filter knew its error)"),
+        ("nees_within_99", "within its 99 % region", 100, " % of frames"),
+        ("truth_resolution_m", "truth read to", 1, " m"),
+    ):
+        if key in summary:
+            text.append(f"{label:24}{summary[key] * scale:.3g}{unit}")
+    return "\n".join(text) if text else "The log has no truth to compare with."
+
+
+def _row(cells):
+    return f"{cells[0]:24}" + "".join(f"{cell:>16}" for cell in cells[1:])
+
+
+def _metres(summary, key):
+    return f"{summary[key]:.3f} m" if key in summary else "–"
+
+
+def _write_files(result, folder, source):
+    if source is None:
+        save_log(folder / "log.npz", result.log)
+        source = "log.npz"
+    landmarks = {f"map_{name}": column for name, column in result.landmarks._asdict().items()}
+    columns = {name: np.asarray(getattr(result, name)) for name in COLUMNS}
+    np.savez_compressed(folder / "steps.npz", **columns, **landmarks)
+    for name, lines in {
+        "run.toml": [run_toml(result, source)],
+        "trajectory.tum": tum_lines(result.time, result.pose),
+        "landmarks.csv": landmark_lines(result.landmarks),
+        "events.jsonl": event_lines(result),
+        "summary.json": [_json(summarise(result), indent=2) + "\n"],
+    }.items():
+        with open(folder / name, "w", encoding="utf-8", newline="\n") as file:
+            file.writelines(lines)
+
+
+def _beside(target):
+    """A name nobody uses, in the same folder, so that renaming it to `target` is one step."""
+    return target.with_name(f".{target.name}.{token_hex(4)}")
+
+
+def _sync(*paths):
+    for path in paths:
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def _move_into_place(partial, target, overwrite):
+    old = _beside(target) if overwrite and target.exists() else None
+    if old:
+        os.rename(target, old)
+    try:
+        os.rename(partial, target)
+    except BaseException:
+        if old:
+            os.rename(old, target)
+        raise
+    _sync(target.parent)
+    if old:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _source(log_source, target):
+    """What run.toml calls the log: a bundled name or a path; None: keep a copy of it."""
+    if log_source is None or (str(log_source) in BUNDLED and not Path(log_source).exists()):
+        return log_source
+    path = Path(log_source).resolve()
+    # A log inside the folder that is being replaced would go with it.
+    return None if path.is_relative_to(target) else str(path)
+
+
+def _find_log(directory, source):
+    try:
+        return load_log(source if source in BUNDLED else directory / source)
+    except ValueError as error:
+        raise ValueError(f"{error}; it is the log of {directory}: say --log PATH") from error
+
+
+def _unwritable(directory, error):
+    return ValueError(
+        f"{directory}: can't be written ({error.strerror}); choose another with --out"
+    )
+
+
+def _toml(value):
+    """A value as TOML: text, truth, whole number or float."""
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(int(value) if isinstance(value, Integral) else float(value))
+
+
+def _toml_table(values):
+    return [f"{name} = {_toml(value)}" for name, value in values.items()]
+
+
+def _json(value, indent=None):
+    """JSON text; numbers that are not finite, which JSON lacks, become null."""
+    return json.dumps(_finite(value), indent=indent, ensure_ascii=False, allow_nan=False)
+
+
+def _finite(value):
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not isfinite(value) else value

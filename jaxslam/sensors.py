@@ -1,0 +1,131 @@
+"""The sensors: `position` (the paper's), `range_bearing` and `bearing`.
+
+All measure in the sensor's frame, whose pose is the robot's composed with the mounting. Functions
+are written for one particle and one landmark; components may also be arrays that broadcast, and
+the filter passes all at once. A landmark is its mean, the lower factor of its covariance and, for
+`bearing`, its anchor: `position` and `range_bearing` keep the point in the world (x, y);
+`bearing` keeps (direction, inverse depth) as seen from the anchor, the sensor's position when the
+landmark was created, so that it is a 2-D normal from the first glimpse on (Civera, Davison and
+Montiel 2008, in the plane; given the particle's path the anchor is known exactly).
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import geometry
+from jaxslam.geometry import direction, norm, wrap
+
+LEAST_INVERSE_DEPTH = 1e-3
+LOG_2PI = math.log(2 * math.pi)
+
+
+class Measurements(NamedTuple):
+    """One frame's measurements in K slots (or T frames', stacked).
+
+    `value` [K, 2]: (range, bearing), (x, y) or (bearing, 0). `cov` [K, 3]: (xx, xy, yy) of a
+    position, else zero. `identity` [K]: index of a measured identity, -1 if none. `valid` [K].
+    `active` []: whether the sensor looked at all.
+    """
+
+    value: jax.Array
+    cov: jax.Array
+    identity: jax.Array
+    valid: jax.Array
+    active: jax.Array
+
+
+class Seen(NamedTuple):
+    """Prediction of one landmark: its measurement, rows of the Jacobian, noise, where it is."""
+
+    value: tuple
+    rows: tuple
+    noise: tuple
+    range: jax.Array
+    bearing: jax.Array
+
+
+def pose_of(pose, params):
+    """The sensor's pose from the robot's."""
+    return geometry.compose(pose, (params.mount_x, params.mount_y, params.mount_yaw))
+
+
+def bearing_variance(r, params):
+    """Variance of a bearing [rad^2] at range `r`: what is seen has a size (`growth`, m)."""
+    return params.sigma_bearing**2 + (params.growth / r) ** 2
+
+
+def observe(sensor, sensor_pose, mean, anchor, params):
+    """`Seen` of a landmark; `noise` holds the variances, and is empty for `position`."""
+    sx, sy, heading = sensor_pose
+    if sensor == "bearing":
+        angle, depth = mean
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        ax, ay = anchor[0] - sx, anchor[1] - sy
+        dx, dy = depth * ax + c, depth * ay + s
+        q = norm(dx, dy)
+        bearing = wrap(direction(dy, dx) - heading)
+        row = ((dy * s + dx * c) / q**2, (dx * ay - dy * ax) / q**2)
+        r = q / jnp.maximum(depth, LEAST_INVERSE_DEPTH)
+        variance = params.sigma_bearing**2 + (params.growth * depth / q) ** 2
+        return Seen((bearing,), (row,), (variance,), r, bearing)
+    dx, dy = mean[0] - sx, mean[1] - sy
+    r = norm(dx, dy)
+    bearing = wrap(direction(dy, dx) - heading)
+    if sensor == "position":
+        c, s = jnp.cos(heading), jnp.sin(heading)
+        return Seen((c * dx + s * dy, c * dy - s * dx), ((c, s), (-s, c)), (), r, bearing)
+    rows = ((dx / r, dy / r), (-dy / r**2, dx / r**2))
+    noise = (params.sigma_range**2, bearing_variance(r, params))
+    return Seen((r, bearing), rows, noise, r, bearing)
+
+
+def locate(sensor, sensor_pose, value, cov, params):
+    """A new landmark from one measurement: mean, factor, anchor (the inverse of `observe`)."""
+    sx, sy, heading = sensor_pose
+    anchor = (sx, sy)
+    if sensor == "bearing":
+        variance = params.sigma_bearing**2 + (params.growth * params.inv_depth_mean) ** 2
+        mean = (heading + value[0], params.inv_depth_mean + jnp.zeros_like(sx))
+        zero = jnp.zeros_like(sx)
+        return mean, (jnp.sqrt(variance) + zero, zero, params.inv_depth_sd + zero), anchor
+    if sensor == "position":
+        px, py = value
+        c, s = jnp.cos(heading), jnp.sin(heading)
+        xx, xy, yy = (component * params.position_scale**2 for component in cov)
+        top = c * c * xx - 2 * c * s * xy + s * s * yy
+        side = c * s * (xx - yy) + (c * c - s * s) * xy
+        factor = geometry.cholesky(top, side, xx * yy - xy * xy)
+        return (sx + c * px - s * py, sy + s * px + c * py), factor, anchor
+    r, b = value
+    r = jnp.maximum(r, 1e-6)
+    c, s = jnp.cos(heading + b), jnp.sin(heading + b)
+    along, across = params.sigma_range**2, r**2 * bearing_variance(r, params)
+    factor = geometry.cholesky(
+        c * c * along + s * s * across, c * s * (along - across), along * across
+    )
+    return (sx + r * c, sy + r * s), factor, anchor
+
+
+def log_new_density(sensor, value, params):
+    """log density of measurements of new landmarks: `density_new` per m^2, seen as `value`."""
+    if sensor == "bearing":
+        area = params.view_range**2 / 2 + jnp.zeros_like(value[0])
+    elif sensor == "position":
+        area = jnp.ones_like(value[0])
+    else:
+        area = jnp.maximum(value[0], 1e-6)
+    return jnp.log1p(-params.outlier) + jnp.log(params.density_new * area)
+
+
+def log_clutter_density(sensor, params):
+    """log density of measurements of nothing: uniform over the view, with probability `outlier`."""
+    width = params.view_max - params.view_min
+    volume = {
+        "bearing": width,
+        "position": width * params.view_range**2 / 2,
+        "range_bearing": width * params.view_range,
+    }[sensor]
+    return jnp.log(params.outlier) - jnp.log(volume)
