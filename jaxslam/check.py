@@ -157,8 +157,12 @@ def _truth(log):
     yield _say(share == 0, f"{len(truth.time)} true poses; {share:.0f} % of frames in their time")
     nearest = int(np.argmin(np.abs(truth.time - log.start)))
     apart = float(np.hypot(*(truth.pose[nearest, :2] - log.start_pose[:2])))
-    if abs(int(truth.time[nearest]) - log.start) < 1e9:
-        allowed = max(0.1, truth.resolution) + 3 * float(np.sqrt(np.trace(log.start_cov[:2, :2])))
+    later = abs(int(truth.time[nearest]) - log.start) / 1e9
+    if later < 1:
+        fastest = float(np.abs(log.odometry[:, 0]).max())
+        driven = 1.2 * fastest * (later if log.odometry_kind == "velocity" else 1.0)
+        spread = 3 * float(np.sqrt(np.trace(log.start_cov[:2, :2])))
+        allowed = max(0.1, truth.resolution) + driven + spread
         yield _say(apart > allowed, f"start pose is {apart:.2f} m from the truth there")
     if share > 0 and _rate(truth.time)[1] < LONG_RUN_S:
         yield from _paths(log)

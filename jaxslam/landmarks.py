@@ -238,7 +238,7 @@ def create(config, sensor_pose, world, match, measurements, params, step_number)
             if world.log_odds is None
             else params.existence_new - params.existence_seen,
             count=-1,
-            birth=step_number * total + k,
+            birth=(step_number * total + k).astype(jnp.int32),
         )
         target = jnp.where(born, slot, len(slots))  # out of range: dropped
         world = jax.tree.map(
@@ -283,7 +283,10 @@ def summarise(world, weight, best, params, config):
         dx, dy = point[0] - centre[0], point[1] - centre[1]
         mx, my = jnp.sum(share * jnp.where(known, dx, 0)), jnp.sum(share * jnp.where(known, dy, 0))
         spread = ((dx - mx) ** 2, (dx - mx) * (dy - my), (dy - my) ** 2)
-        total = [jnp.sum(jnp.where(share > 0, share * (a + b), 0)) for a, b in zip(cov, spread)]
+        total = [
+            jnp.sum(jnp.where(share > 0, share * (own + between), 0))
+            for own, between in zip(cov, spread, strict=True)
+        ]
         return jnp.stack([centre[0] + mx, centre[1] + my]), jnp.stack(total)
 
     mean, cov = jax.lax.map(lambda args: one(*args), (mine.birth, jnp.stack(centre, -1)))

@@ -110,7 +110,7 @@ def _draw_landmarks(axes, landmarks, low, high):
     (plus,) = axes.plot(*mean.T, "+", ms=8, mew=1.8, color=LANDMARK, label="landmark", zorder=5)
     plus.set_path_effects(halo)
     outlines = LineCollection(
-        ellipses(mean, cov), colors=LANDMARK, linewidths=0.9, zorder=5, label="its 3σ"
+        ellipses(mean, cov), colors=LANDMARK, linewidths=0.9, zorder=5, label=r"its 3$\sigma$"
     )
     axes.add_collection(outlines, autolim=False)
     return int(((mean < low) | (mean > high)).any(1).sum())
@@ -133,31 +133,35 @@ def _draw_plan(axes, log, core):
 
 
 def _limits(result, true):
-    """The picture's corners low, high and those of what it is about.
+    """The picture's corners low, high [2] and those of the room: what is known without the filter.
 
-    It shows plan, paths and true landmarks; of dead reckoning and of estimated landmarks, which may
-    be anywhere, only what lies within a third of that beyond it.
+    The picture shows the room and the filter's path; of dead reckoning and of estimated landmarks,
+    which may be anywhere, only what lies within a third of that beyond it.
     """
     plan, truth = result.log.plan, result.log.truth
-    points = [true[with_truth(true), :2], result.pose[:, :2], result.log.start_pose[None, :2]]
+    room = [true[with_truth(true), :2]]
     if plan is not None and plan.segments is not None:
-        points.append(plan.segments.reshape(-1, 2))
+        room.append(plan.segments.reshape(-1, 2))
     if plan is not None and plan.image is not None:
         size = np.array(plan.image.shape[::-1]) * plan.scale
-        points.append(np.array([plan.origin, plan.origin + size]))
+        room.append(np.array([plan.origin, plan.origin + size]))
     if truth is not None and truth.landmarks is not None:
-        points.append(truth.landmarks)
-    points = np.concatenate(points)
-    points = points[np.isfinite(points).all(1)]
-    core = low, high = points.min(0), points.max(0)
+        room.append(truth.landmarks)
+    path = np.concatenate([result.pose[:, :2], result.log.start_pose[None, :2]])
+    low, high = _corners(np.concatenate([*room, path]))
+    core = _corners(np.concatenate(room)) if sum(map(len, room)) else (low, high)
     beyond = max((high - low).max() / 3, 0.5)
-    loose = np.concatenate(
-        [result.dead_reckoning[:, :2], np.reshape(result.landmarks.mean, (-1, 2))]
-    )
+    marks = np.reshape(result.landmarks.mean, (-1, 2))
+    loose = np.concatenate([result.dead_reckoning[:, :2], marks])
     loose = loose[((loose >= low - beyond) & (loose <= high + beyond)).all(1)]
-    every = np.concatenate([loose, low[None], high[None]])
-    pad = 0.04 * (every.max(0) - every.min(0)).max() + 0.1
-    return every.min(0) - pad, every.max(0) + pad, core
+    low, high = _corners(np.concatenate([loose, low[None], high[None]]))
+    pad = 0.04 * (high - low).max() + 0.1
+    return low - pad, high + pad, core
+
+
+def _corners(points):
+    """The lower-left and upper-right corner of points [n, 2]."""
+    return np.nanmin(points, 0), np.nanmax(points, 0)
 
 
 def _title(result, true, outside):
@@ -183,6 +187,7 @@ def draw_error(result):
     known = with_truth(true).any()
     error = np.hypot(*(result.pose - true)[:, :2].T)
     turned = np.degrees(wrap(result.pose - true)[:, 2])
+    turned[1:][np.abs(np.diff(turned)) > 180] = np.nan  # no line across the whole panel
     xx, xy, yy = result.cov[:, (0, 0, 1), (0, 1, 1)].T
     largest = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)  # variance, in the worst direction
     for axes, low, band in (
@@ -190,14 +195,14 @@ def draw_error(result):
         (heading, -1, 3 * np.degrees(np.sqrt(result.cov[:, 2, 2].clip(0)))),
     ):
         fill = axes.fill_between(seconds, low * band, band, color=FILTER, alpha=0.22, lw=0)
-    fill.set_label("filter's own 3σ")
+    fill.set_label(r"filter's own 3$\sigma$")
     _curve(position, seconds, error, FILTER, label="filter")
     _curve(heading, seconds, turned, FILTER)
     _curve(drift, seconds, error, FILTER)
     reference = true if known else result.pose
     reckoning = np.hypot(*(result.dead_reckoning - reference)[:, :2].T)
     _curve(drift, seconds, reckoning, RECKONING, "--", "dead reckoning")
-    about = "errors, not aligned; gaps: no truth" if known else "no truth in the log: 3σ alone"
+    about = "errors, not aligned; gaps: no truth" if known else "the log has no truth"
     position.set(title=f"{result.log.name}: {about}", ylabel="position error [m]", ylim=(0, None))
     heading.set(ylabel="heading error [°]")
     about = "beside dead reckoning" if known else "dead reckoning, measured from the filter"

@@ -9,12 +9,14 @@ import json
 import os
 import shutil
 import tomllib
+import zlib
 from importlib.metadata import PackageNotFoundError, version
 from math import cos, isfinite, sin
 from numbers import Integral
 from pathlib import Path
 from platform import python_version
 from secrets import token_hex
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -98,7 +100,10 @@ def load(directory, log=None):
         told = tomllib.loads((directory / "run.toml").read_text(encoding="utf-8"))
         config, params = Config(**told["config"]), Params(**told["params"])
         summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
-        with np.load(directory / "steps.npz", allow_pickle=False) as steps:
+        with (
+            open(directory / "steps.npz", "rb") as file,
+            np.load(file, allow_pickle=False) as steps,
+        ):
             columns = {name: steps[name] for name in COLUMNS}
             landmarks = {name[4:]: steps[name] for name in steps.files if name.startswith("map_")}
         seed, source = told["seed"], told["log"]
@@ -107,7 +112,7 @@ def load(directory, log=None):
         raise ValueError(
             f"{directory}: no {Path(error.filename).name}; not a run's folder"
         ) from None
-    except (OSError, KeyError, TypeError, ValueError, EOFError) as error:
+    except (OSError, KeyError, TypeError, ValueError, EOFError, BadZipFile, zlib.error) as error:
         raise ValueError(f"{directory}: a broken run's folder ({error}); run it again") from error
     log = _find_log(directory, source) if log is None else load_log(log)
     if not np.isin(columns["time"], log.frame_time).all():
@@ -252,7 +257,9 @@ def error_table(summary):
         ("truth_resolution_m", "truth read to", 1, " m"),
     ):
         if key in summary:
-            text.append(f"{label:24}{summary[key] * scale:.3g}{unit}")
+            value = summary[key] * scale
+            number = f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
+            text.append(f"{label:24}{number}{unit}")
     return "\n".join(text) if text else "The log has no truth to compare with."
 
 
@@ -261,7 +268,7 @@ def _row(cells):
 
 
 def _metres(summary, key):
-    return f"{summary[key]:.3f} m" if key in summary else "–"
+    return f"{summary[key]:.3f} m" if key in summary else "-"
 
 
 def _write_files(result, folder, source):

@@ -11,13 +11,19 @@ def systematic(log_weight, uniform):
     """
     n = len(log_weight)
     weight = jnp.exp(log_weight - log_weight.max())
-    cumulative = jnp.cumsum(weight)
-    cumulative = cumulative / cumulative[-1]
-    position = (jnp.arange(n, dtype=weight.dtype) + uniform) / n
-    # By rounding the last position can reach 1, where no particle is.
-    position = jnp.minimum(position, jnp.nextafter(jnp.ones((), weight.dtype), 0.0))
-    # side="right": the first j whose cumulative weight exceeds the position, so its own is > 0.
-    return jnp.searchsorted(cumulative, position, side="right", method="scan").astype(jnp.int32)
+    # Sums in parallel round differently from particle to particle: they may step back, or forward
+    # at a weight of zero. Hence the maximum, and the move back to the last particle with a weight.
+    cumulative = jax.lax.cummax(jnp.cumsum(weight))
+    total = cumulative[-1]
+    position = (jnp.arange(n, dtype=weight.dtype) + uniform) / n * total
+    # By rounding the last position can reach the total, beyond which there is no particle.
+    position = jnp.minimum(position, jnp.nextafter(total, jnp.zeros_like(total)))
+    # side="right": the first j whose cumulative weight exceeds the position.
+    chosen = jnp.searchsorted(cumulative, position, side="right", method="scan")
+    index = jnp.arange(n, dtype=jnp.int32)
+    last = jax.lax.cummax(jnp.where(weight > 0, index, -1))
+    first = jnp.argmax(weight > 0).astype(jnp.int32)
+    return jnp.maximum(last[chosen], first)
 
 
 def gather(tree, ancestors, wanted):

@@ -88,7 +88,7 @@ class Result:
     @property
     def log_likelihood(self):
         """Log evidence of the whole log, nats."""
-        return float(np.sum(self.log_evidence))
+        return float(np.sum(self.log_evidence, dtype=float))
 
     @cached_property
     def flags(self):
@@ -111,11 +111,11 @@ class Result:
             lines.append("the pose estimate is not finite")
         return lines
 
-    def save(self, directory, overwrite=False):
-        """Write the run's folder (`report.save`)."""
+    def save(self, directory, overwrite=False, log_source=None):
+        """Write the run's folder (`report.save`); without a `log_source` the log is copied too."""
         from jaxslam import report
 
-        report.save(self, directory, overwrite=overwrite)
+        report.save(self, directory, overwrite=overwrite, log_source=log_source)
 
 
 def config_for(log, sensor=None, association="maximum_likelihood", **settings):

@@ -44,7 +44,7 @@ def make_result(frames=40, truth=True, shift=0.1):
     match = np.full((frames, 3), -3)
     match[:, 1] = -2
     match[:, 0] = np.where(np.arange(frames) < 4, -1, np.arange(frames) % 4 * 3)
-    marks = np.vstack([LANDMARKS + [shift, 0], [[30.0, 30.0]]])
+    marks = np.vstack([LANDMARKS + np.array([shift, 0]), [[30.0, 30.0]]])
     zero = np.zeros(frames)
     return Result(
         log=log,

@@ -88,7 +88,8 @@ def test_relative_error_is_that_of_a_scale_and_of_a_bend():
     steps = np.arange(0, 20, 0.05)
     truth = np.stack([steps, 0 * steps, 0 * steps], 1)
     length, turn = evaluate.rpe(truth * [1.03, 1, 1], truth, distance=2.0)
-    assert length == pytest.approx(0.06, rel=0.03) and turn == 0
+    assert length == pytest.approx(0.06, rel=0.03)
+    assert turn == 0
     bent = np.stack([np.sin(steps / 10) * 10, 10 - np.cos(steps / 10) * 10, steps / 10], 1)
     assert evaluate.rpe(bent, truth, distance=2.0)[1] == pytest.approx(0.2, rel=0.03)
     time = np.arange(steps.size) * SECOND // 10
@@ -168,7 +169,7 @@ def test_pairing_is_the_best_over_all_and_not_greedy():
 
 def test_known_identities_pair_by_identity_without_a_gate():
     truth = Truth(landmarks=LANDMARKS, landmark_id=np.array([4, 3, 2, 1]))
-    found = evaluate.map_error(LANDMARKS[::-1] + [2, 0], np.array([1, 2, 3, 99]), truth)
+    found = evaluate.map_error(LANDMARKS[::-1] + np.array([2, 0]), np.array([1, 2, 3, 99]), truth)
     assert found == dict(matched=3, missed=1, spurious=1, rmse_m=pytest.approx(2.0))
     swapped = evaluate.map_error(LANDMARKS, np.array([1, 2, 3, 4]), truth)
     assert swapped["rmse_m"] > 4  # right places, wrong names

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from jaxslam.config import Params
+from jaxslam.config import Params, default_params
 from jaxslam.frames import dead_reckoning, frames, increments
 from jaxslam.log import Log, load_log
 
@@ -265,6 +265,13 @@ def test_positions_made_of_range_and_bearing():
     ranges, bearings = r + 0.1 * rng.normal(size=200_000), b + sd * rng.normal(size=200_000)
     cov = np.cov(ranges * np.cos(bearings), ranges * np.sin(bearings))
     assert m.cov[0, 2] == pytest.approx((cov[0, 0], cov[0, 1], cov[1, 1]), rel=0.02)
+
+
+def test_noise_of_made_positions_is_the_declared_one():
+    declared = frames(five(noise={"sigma_range": 0.4, "growth": 0.0}), "position").measurements
+    given = numbers(sigma_range=0.4, sigma_bearing=default_params("position").sigma_bearing)
+    same = frames(five(), "position", params=given).measurements
+    assert declared.cov == pytest.approx(same.cov)
 
 
 def test_positions_of_the_log_itself_come_first():

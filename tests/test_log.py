@@ -54,7 +54,8 @@ def assert_same(a, b):
         if dataclasses.is_dataclass(left):
             assert_same(left, right)
         elif isinstance(left, np.ndarray):
-            assert left.dtype == right.dtype and np.array_equal(left, right), item.name
+            assert left.dtype == right.dtype, item.name
+            assert np.array_equal(left, right), item.name
         else:
             assert left == right, item.name
 

@@ -7,7 +7,7 @@ import pytest
 import scipy.io
 
 from jaxslam.log import load_log, save_log
-from jaxslam.readers import read
+from jaxslam.readers import mat5, read
 from jaxslam.readers.csvpair import read_csv
 from jaxslam.readers.mat import read_mat
 
@@ -124,6 +124,30 @@ def test_mat_bad_rows_are_counted(tmp_path):
 )
 def test_mat_refused(tmp_path, changes, message):
     refused(mat(tmp_path, **changes), message)
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_mat_plain_or_compressed(tmp_path, compressed):
+    path = tmp_path / "course.mat"
+    scipy.io.savemat(path, course() | {"text": "x", "s": {"a": 1}}, do_compression=compressed)
+    whole, refusals = path.read_bytes(), []
+    assert read(path).range.tolist() == [1, 1, 2, 2]
+    for place in range(0, len(whole), 7):  # no byte turned over may do more than be refused
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
+        try:
+            read(path)
+        except ValueError as err:
+            refusals.append(str(err))
+    assert len(refusals) > len(whole) / 7 / 10
+    assert all(str(path) in refusal for refusal in refusals)
+
+
+def test_mat_bomb_is_not_unpacked(tmp_path, monkeypatch):
+    path = tmp_path / "course.mat"
+    scipy.io.savemat(path, course(r=np.zeros((4, 10**5))), do_compression=True)
+    assert path.stat().st_size < 10**5
+    monkeypatch.setattr(mat5, "MAX_BYTES", 10**6)
+    refused(path, "longer than")
 
 
 def test_mat_broken_file(tmp_path):
@@ -434,6 +458,8 @@ CSV_BAD = {
     "cut": ({"measured": MEASURED + "2.0,0.1,"}, "line 6: the file ends here .3 columns"),
     "binary": ({"measured": "\x00\x93NUMPY" * 50}, "no known header"),
     "landmarks": ({"landmarks": "id,x_m,y_m\n7,1,1\n7,2,2\n"}, "same id"),
+    "landmark ids": ({"landmarks": "id,x_m,y_m\n7.5,1,1\n1e99,2,2\n"}, "line 2: id is not a whole"),
+    "stamps": ({"odometry": ODOMETRY + "1e999999999,0,0\n" * 2}, "line 5: stamp 1e999999999: "),
 }
 
 

@@ -19,7 +19,16 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.log import Log, Truth
-from jaxslam.readers.table import in_order, parse, pose_at, read_lines, settle, without, wrapped
+from jaxslam.readers.table import (
+    in_order,
+    parse,
+    pose_at,
+    read_lines,
+    settle,
+    whole,
+    without,
+    wrapped,
+)
 
 VELOCITY = ("forward_m_s", "yaw_rate_rad_s")
 COMMAND = ("distance_m", "turn_rad")
@@ -133,8 +142,8 @@ def _measurements(file, skipped):
     table = without(table, partly, "a measurement with empty cells")
     if "identity" in columns:
         number = table.value[:, -1]
-        wrong = ~np.isnan(number) & ((number != np.round(number)) | (np.abs(number) > 1e15))
-        table = without(table, wrong | (number < -1), "identity is not a whole number from -1")
+        wrong = ~np.isnan(number) & (~whole(number) | (number < -1))
+        table = without(table, wrong, "identity is not a whole number from -1")
     if "bearing_rad" in columns:
         reason = "bearing beyond 2 pi rad (degrees? multiply by pi/180)"
         table = without(table, np.abs(table.value[:, 0]) > 2 * pi, reason, unit=True)
@@ -167,6 +176,8 @@ def _truth(files, skipped):
         order = in_order(table.time, "truth row", skipped)
         known = {"time": table.time[order], "pose": table.value[order]}
     if "landmarks" in files:
-        table = settle(_parse(files["landmarks"], stamped=False), skipped)
+        table = _parse(files["landmarks"], stamped=False)
+        table = without(table, ~whole(table.value[:, 0]), "id is not a whole number")
+        table = settle(table, skipped)
         known |= {"landmarks": table.value[:, 1:], "landmark_id": table.value[:, 0].astype(int)}
     return Truth(**known) if known else None

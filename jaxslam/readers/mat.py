@@ -4,14 +4,13 @@ from math import pi
 from pathlib import Path
 
 import numpy as np
-import scipy.io
 
 from jaxslam.log import Log, Truth
-from jaxslam.readers.table import in_order, pose_at
+from jaxslam.readers.mat5 import read_variables
+from jaxslam.readers.table import LAST_STAMP_S, NANOSECONDS, in_order, pose_at
 
 NEEDED = ("t", "v", "om", "r", "b", "d")
 OPTIONAL = ("l", "x_true", "y_true", "th_true", "true_valid")
-MAX_NUMBERS = 1 << 26
 VIEW = (-2 * pi / 3, 2 * pi / 3, 6.0)  # rad, rad, m: 240 deg laser scanner, 5.6 m seen at most
 STEP_NS = 1000  # stamps are read to the microsecond: float64 seconds hold no more that is meant
 
@@ -25,32 +24,15 @@ def read_mat(path, lag=1, time_offset=0.0):
     is a frame. The start pose is the truth at the first step (zero without). Raises `ValueError`
     naming the file and variable.
     """
-    path = Path(path)
+    path, skipped = Path(path), {}
     data = _load(path)
-    skipped = {}
-    usable = np.isfinite(data["t"])
-    if (~usable).any():
-        skipped["step without a stamp"] = int((~usable).sum())
-    if np.abs(data["t"][usable]).max(initial=0) >= 9e9:
-        raise ValueError(f"{path}: t: is not in seconds (nanoseconds? divide them by 1e9)")
-    time = np.round(data["t"][usable] * (1e9 / STEP_NS)).astype(np.int64) * STEP_NS
-    order = in_order(time, "step", skipped)
-    steps, time = np.flatnonzero(usable)[order], time[order]
-    if len(steps) < 2:
-        raise ValueError(f"{path}: t: {len(steps)} usable steps; at least 2 are needed")
+    steps, time = _steps(path, data["t"], skipped)
     odometry = np.column_stack([data["v"], data["om"]])[steps[lag:]]
     driven = np.isfinite(odometry).all(axis=1)
     if (~driven).any():
         skipped["odometry that is not finite"] = int((~driven).sum())
     ranges, bearings = data["r"][steps], data["b"][steps]
-    seen = (ranges != 0) | (bearings != 0)
-    good = seen & np.isfinite(ranges) & np.isfinite(bearings) & (ranges > 0)
-    if (seen & ~good).any():
-        skipped["range or bearing that is not finite, or range not above 0"] = int(
-            (seen & ~good).sum()
-        )
-    if np.abs(bearings[good]).max(initial=0) > 2 * pi:
-        raise ValueError(f"{path}: b: beyond 2 pi rad (degrees? multiply by pi/180)")
+    good = _seen(path, ranges, bearings, skipped)
     frame, identity = np.nonzero(good)
     truth = _truth(data, steps, time, identity)
     start = None if truth.time is None else pose_at(time[0], truth.time, truth.pose)
@@ -72,6 +54,32 @@ def read_mat(path, lag=1, time_offset=0.0):
     )
 
 
+def _steps(path, t, skipped):
+    """Rows in order of time, and their stamps in ns."""
+    usable = np.isfinite(t)
+    if not usable.all():
+        skipped["step without a stamp"] = int((~usable).sum())
+    if np.abs(t[usable]).max(initial=0) >= LAST_STAMP_S:
+        raise ValueError(f"{path}: t: {NANOSECONDS}")
+    time = np.round(t[usable] * (1e9 / STEP_NS)).astype(np.int64) * STEP_NS
+    order = in_order(time, "step", skipped)
+    if len(order) < 2:
+        raise ValueError(f"{path}: t: {len(order)} usable steps; at least 2 are needed")
+    return np.flatnonzero(usable)[order], time[order]
+
+
+def _seen(path, ranges, bearings, skipped):
+    """Mask of the measurements; what is there but no measurement is counted."""
+    there = (ranges != 0) | (bearings != 0)
+    good = there & np.isfinite(ranges) & np.isfinite(bearings) & (ranges > 0)
+    lost = int((there & ~good).sum())
+    if lost:
+        skipped["range or bearing that is not finite, or range not above 0"] = lost
+    if np.abs(bearings[good]).max(initial=0) > 2 * pi:
+        raise ValueError(f"{path}: b: beyond 2 pi rad (degrees? multiply by pi/180)")
+    return good
+
+
 def _truth(data, steps, time, identity):
     """Poses where the course calls them valid, landmarks and identities."""
     known = {}
@@ -87,28 +95,20 @@ def _truth(data, steps, time, identity):
 
 
 def _load(path):
-    """Variables by name, shapes and sizes checked before they are read."""
+    """Variables by name, each of the right shape."""
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     try:
-        listed = {name: (shape, kind) for name, shape, kind in scipy.io.whosmat(path)}
-        sizes = {name: np.prod(listed[name][0], dtype=float) for name in listed}
-        wanted = [name for name in NEEDED + OPTIONAL if name in listed]
-        small = sum(sizes[name] for name in wanted) <= MAX_NUMBERS
-        data = scipy.io.loadmat(path, variable_names=wanted) if small else {}
-    except Exception as err:  # foreign bytes: scipy raises whatever it likes
-        reason = (str(err).splitlines() or [type(err).__name__])[0]
-        raise ValueError(f"{path}: not a MATLAB file of version 5, or damaged: {reason}") from err
-    missing = [name for name in NEEDED if name not in wanted]
+        data = read_variables(path, NEEDED + OPTIONAL)
+    except ValueError as err:
+        raise ValueError(f"{path}: not a MATLAB file of version 5, or damaged: {err}") from err
+    missing = [name for name in NEEDED if name not in data]
     if missing:
         raise ValueError(f"{path}: has no variable {', '.join(missing)}; is it the course's log?")
-    if not small:
-        raise ValueError(f"{path}: more than {MAX_NUMBERS} numbers")
-    for name in wanted:
-        plain = isinstance(data[name], np.ndarray) and data[name].dtype.kind in "iufb"
-        if not plain:
+    for name, array in data.items():
+        if array is None:
             raise ValueError(f"{path}: {name}: is not a plain array of numbers")
-    return _shaped(path, {name: np.asarray(data[name], float) for name in wanted})
+    return _shaped(path, data)
 
 
 def _shaped(path, data):

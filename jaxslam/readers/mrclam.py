@@ -6,7 +6,16 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.log import NOT_USED, Log, Truth
-from jaxslam.readers.table import in_order, parse, pose_at, read_lines, settle, without, wrapped
+from jaxslam.readers.table import (
+    in_order,
+    parse,
+    pose_at,
+    read_lines,
+    settle,
+    whole,
+    without,
+    wrapped,
+)
 
 ROBOTS = 5  # subjects 1-5 are robots, those above landmarks
 VIEW = (-0.60, 0.60, 9.0)  # rad, rad, m: the camera's field of view
@@ -59,9 +68,12 @@ def _robot(folder, robot):
     return robot
 
 
-def _table(path, width, skipped, stamped=True):
+def _table(path, width, skipped, ids=0):
+    """Rows that begin with a stamp, or with `ids` whole numbers."""
     lines, complete = read_lines(path)
-    return settle(parse(path, lines, width, complete, stamped), skipped)
+    table = parse(path, lines, width, complete, stamped=not ids)
+    wrong = ~whole(table.value[:, :ids]).all(axis=1)
+    return settle(without(table, wrong, "number is not whole"), skipped)
 
 
 def _measurements(path, skipped):
@@ -72,8 +84,9 @@ def _measurements(path, skipped):
     degrees = np.abs(bearing) > 2 * np.pi
     table = without(table, degrees, "bearing beyond 2 pi rad (degrees? times pi/180)", unit=True)
     code, distance, bearing = table.value.T
-    wrong = (distance <= 0) | (code != np.round(code)) | (np.abs(code) > 1e9)
-    table = settle(without(table, wrong, "range not above 0 m, or barcode not a number"), skipped)
+    wrong = (distance <= 0) | ~whole(code)
+    table = without(table, wrong, "range not above 0 m, or barcode not a whole number")
+    table = settle(table, skipped)
     order = in_order(table.time, "measurement", skipped, unique=False)
     value = table.value[order]
     value[:, 2] = wrapped(value[:, 2])
@@ -82,7 +95,7 @@ def _measurements(path, skipped):
 
 def _subjects(path, codes, skipped):
     """Subject per barcode seen, 0 where it is not in the list; what is no landmark is counted."""
-    table = _table(path, 2, skipped, stamped=False)
+    table = _table(path, 2, skipped, ids=2)
     subjects = {int(code): int(subject) for subject, code in table.value}
     if len(subjects) != len(table.value):
         raise ValueError(f"{path}: two subjects have the same barcode")
@@ -106,6 +119,6 @@ def _truth(folder, robot, identity, skipped):
         known = {"time": table.time[order], "pose": table.value[order]}
     path = folder / "Landmark_Groundtruth.dat"
     if path.exists():
-        table = _table(path, 5, skipped, stamped=False)
+        table = _table(path, 5, skipped, ids=1)
         known |= {"landmarks": table.value[:, 1:3], "landmark_id": table.value[:, 0].astype(int)}
     return Truth(**known, identity=identity)

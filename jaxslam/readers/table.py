@@ -13,7 +13,7 @@ import numpy as np
 
 MAX_BYTES = 1 << 29
 BAD_SHARE = 0.05
-LAST_STAMP_S = 9e9  # int64 ns end at 9.2e9 s, the year 2262
+LAST_STAMP_S = 9_000_000_000  # int64 ns end at 9.2e9 s, the year 2262
 TEN_YEARS_S = 10 * 365.25 * 86400
 NANOSECONDS = "that is no time in seconds (nanoseconds? divide them by 1e9)"
 
@@ -84,7 +84,7 @@ def _stamp(text):
         raise ValueError(f"stamp {text[:40]!r} is not a number") from None
     if not seconds.is_finite():
         raise ValueError(f"stamp {text[:40]} is not finite")
-    if abs(seconds) >= LAST_STAMP_S:
+    if seconds.copy_abs() >= LAST_STAMP_S:
         raise ValueError(f"stamp {text[:40]}: {NANOSECONDS}")
     return round(seconds * 10**9)
 
@@ -108,6 +108,11 @@ def without(table, wrong, reason, unit=False):
         raise ValueError(f"{table.path}, line {lines[0]}: {reason} ({len(lines)} rows)")
     bad = table.bad + [(int(line), reason) for line in lines]
     return Table(table.path, table.line[~wrong], table.time[~wrong], table.value[~wrong], bad)
+
+
+def whole(values):
+    """Mask of the numbers that are whole, and small enough to be meant as such."""
+    return (values == np.round(values)) & (np.abs(values) < 2**53)
 
 
 def settle(table, skipped):

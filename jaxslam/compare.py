@@ -1,0 +1,216 @@
+"""The filter beside the NumPy baseline, fed the same draws: agreement, accuracy and time.
+
+In float64 both must take every decision alike and differ by rounding only. In float32 a decision
+that is nearly a tie falls differently sooner or later; from there on they are two honest runs.
+"""
+
+import dataclasses
+import time
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam import baseline, geometry
+from jaxslam import filter as fastslam
+from jaxslam.config import Params, default_params
+from jaxslam.evaluate import ate, truth_at, wrap
+from jaxslam.frames import frames
+
+
+class Agreement(NamedTuple):
+    """Both filters over T steps, N particles.
+
+    `same`: steps, from the first on, with equal ancestors and associations of all particles.
+    Largest absolute differences: of `pose` [m, rad] and `log_weight` over these steps, all
+    particles; of `landmarks` (means and covariances) and `births`, at the end (inf where only one
+    has a landmark; NaN when `same` < T). Counted in the baseline: steps that `resampled`; landmarks
+    `born`, `freed` and lost in `overflow`, per particle; measurements that were `clutter`, per
+    particle. Mean poses [T, 3] and seconds of both, `compile_seconds` apart.
+    """
+
+    steps: int
+    particles: int
+    same: int
+    pose: float
+    log_weight: float
+    landmarks: float
+    resampled: int
+    born: float
+    freed: float
+    overflow: float
+    clutter: float
+    pose_baseline: np.ndarray
+    pose_filter: np.ndarray
+    seconds_baseline: float
+    seconds_filter: float
+    compile_seconds: float
+
+
+class Comparison(NamedTuple):
+    """One particle count: `double` and `single` precision, and unaligned ATE [m] of both filters
+    in single precision (NaN without truth)."""
+
+    double: Agreement
+    single: Agreement
+    ate_baseline: float
+    ate_filter: float
+
+
+def compare(log, config, params=None, seed=0, steps=200, every=None, progress=None):
+    """`Comparison` over the first `steps` frames, of which each `every`-th is used.
+
+    `every`: None for a tenth of the log, or all frames if the log is short. `progress`: called with
+    (what, done, total).
+    """
+    if every is None:
+        every = max(1, len(log.frame_time) // (10 * steps))
+    log = select(log, np.arange(0, len(log.frame_time), every)[:steps])
+    double = agreement(log, config, params, seed, steps, True, _named(progress, "float64"))
+    single = agreement(log, config, params, seed, steps, False, _named(progress, "float32"))
+    true = truth_at(log.truth, log.frame_time)
+    errors = [ate(p, true, align=False)[0] for p in (single.pose_baseline, single.pose_filter)]
+    return Comparison(double, single, *errors)
+
+
+def agreement(log, config, params=None, seed=0, steps=None, double=True, progress=None):
+    """`Agreement` over the log's first `steps` frames (None: all).
+
+    `double`: the filter in float64, without changing JAX's global settings; otherwise in float32.
+    The baseline is in float64 always, and gets the filter's draws. `progress`: called with
+    (done, total), first with (0, total) before compiling.
+    """
+    params = default_params(config.sensor, log) if params is None else params
+    params = Params(*map(float, params))
+    if steps is not None:
+        log = select(log, np.arange(min(steps, len(log.frame_time))))
+    data = frames(log, config.sensor, config.measurements, params, config.association == "known")
+    if progress:
+        progress(0, len(data.time))
+    # The runner's local origin: float32 has 7 digits.
+    start = log.start_pose - np.array([*log.start_pose[:2], 0.0])
+    with jax.enable_x64(double):
+        state, trace, draws, compiled, ran = _run_filter(data, config, params, seed, start, log)
+    begin = time.perf_counter()
+    reference = baseline.run(
+        data.odometry, data.measurements, params, config, start, log.start_cov, *draws,
+        progress=progress,
+    )  # fmt: skip
+    spent = time.perf_counter() - begin
+    shift = np.array([*log.start_pose[:2], 0.0])
+    return Agreement(
+        len(data.time),
+        config.particles,
+        *_differences(state, trace, reference),
+        resampled=int(reference.resampled.sum()),
+        born=float(reference.births.sum() / config.particles),
+        freed=float(reference.freed.sum() / config.particles),
+        overflow=float(reference.overflow.sum() / config.particles),
+        clutter=float((reference.match == baseline.CLUTTER).sum() / config.particles),
+        pose_baseline=reference.pose_mean + shift,
+        pose_filter=trace.mean + shift,
+        seconds_baseline=spent,
+        seconds_filter=ran,
+        compile_seconds=compiled,
+    )
+
+
+def select(log, kept):
+    """The log with only these frames (increasing numbers [F]): a slower sensor, the same drive."""
+    number = np.full(len(log.frame_time), -1)
+    number[kept] = np.arange(len(kept))
+    rows = number[log.frame] >= 0
+    columns = ("bearing", "range", "point", "point_cov", "identity", "descriptor")
+    truth = log.truth
+    if truth is not None and truth.identity is not None:
+        truth = dataclasses.replace(truth, identity=truth.identity[rows])
+    return dataclasses.replace(
+        log,
+        frame_time=log.frame_time[kept],
+        frame=number[log.frame[rows]],
+        truth=truth,
+        **{n: getattr(log, n)[rows] for n in columns if getattr(log, n) is not None},
+    )
+
+
+class _Trace(NamedTuple):
+    """Every step's poses [T, 3, N], log weights [T, N], ancestors [T, N], matches [T, K, N] and
+    mean pose [T, 3]."""
+
+    pose: np.ndarray
+    log_weight: np.ndarray
+    ancestors: np.ndarray
+    match: np.ndarray
+    mean: np.ndarray
+
+
+@partial(jax.jit, static_argnames="config")
+def _steps(key, state, odometry, measurements, params, config):
+    def body(state, frame):
+        state, info = fastslam.step(key, state, *frame, params, config)
+        kept = state.pose, state.log_weight, info.ancestors, info.match, info.estimate.mean
+        return state, _Trace(*kept)
+
+    return jax.lax.scan(body, state, (odometry, measurements))
+
+
+def _run_filter(data, config, params, seed, start, log):
+    """Final state, `_Trace`, draws for the baseline, seconds to compile and to run."""
+    key = jax.random.key(seed)
+    state = fastslam.init(config, key, start, log.start_cov)
+    given = jax.tree.map(jnp.asarray, (data.odometry, data.measurements, params))
+    begin = time.perf_counter()
+    steps = _steps.lower(key, state, *given, config).compile()
+    compiled = time.perf_counter()
+    final, trace = jax.block_until_ready(steps(key, state, *given))
+    done = time.perf_counter()
+    numbers = jnp.arange(len(data.time), dtype=jnp.int32)
+    normals, uniforms = jax.vmap(lambda step: fastslam.draws(key, step, config))(numbers)
+    draws = fastslam.start_draws(key, config), normals, uniforms
+    host = [jax.tree.map(np.asarray, tree) for tree in (final, trace, draws)]
+    return *host, compiled - begin, done - compiled
+
+
+def _differences(state, trace, reference):
+    """`same`, `pose`, `log_weight` and `landmarks` of `Agreement`."""
+    equal = (trace.ancestors == reference.ancestors).all(1)
+    equal &= (np.swapaxes(trace.match, 1, 2) == reference.match).all((1, 2))
+    total = len(equal)
+    same = total if equal.all() else int(np.argmin(equal))
+    if same == 0:
+        return 0, np.nan, np.nan, np.nan
+    pose = (trace.pose - reference.poses)[:same]
+    pose[:, 2] = wrap(pose[:, 2])
+    weight, other = trace.log_weight[:same], reference.log_weight[:same]
+    apart = np.where(weight == other, 0.0, np.abs(weight - np.where(weight == other, 0, other)))
+    far = _map_difference(state.landmarks, reference.particles) if same == total else np.nan
+    return same, float(np.abs(pose).max()), float(apart.max()), far
+
+
+def _map_difference(world, particles):
+    """Largest difference of any number of any landmark of any particle; inf: not the same ones."""
+    cov = np.stack(geometry.covariance(world.factor.astype(float)))
+    largest = 0.0
+    for i, particle in enumerate(particles):
+        for slot, landmark in enumerate(particle.landmarks):
+            count = 0 if landmark is None else landmark.count
+            if count != world.count[slot, i]:
+                return np.inf
+            if landmark is None:
+                continue
+            (xx, xy), (_, yy) = landmark.cov
+            pairs = [(world.mean, landmark.mean), (cov, (xx, xy, yy))]
+            pairs += [(world.birth[None], landmark.birth)]
+            pairs += [(world.anchor, landmark.anchor)] if world.anchor is not None else []
+            pairs += (
+                [(world.log_odds[None], landmark.log_odds)] if world.log_odds is not None else []
+            )
+            for mine, other in pairs:
+                largest = max(largest, float(np.abs(mine[:, slot, i] - other).max()))
+    return largest
+
+
+def _named(progress, what):
+    return progress and partial(progress, what)
