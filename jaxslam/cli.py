@@ -17,68 +17,55 @@ from cyclopts.validators import Number
 DEMO = "lost-in-the-woods"
 HELP = f"""FastSLAM: from a logged run to map, trajectory and figures.
 
-Begin with:  jaxslam demo  (a real robot's run becomes a map in runs/demo)
+Begin with:  jaxslam demo     (a real robot's run becomes a map, in runs/demo)
 Then:        jaxslam run {DEMO} --sensor bearing
-Each command has its own --help with an example. LOG is a .npz file or the name of a bundled
-log, {DEMO}. Lengths are metres, angles radians, times seconds.
 
-Exit codes: 0 ok, 1 finished with warnings, 2 bad input or usage, 130 interrupted."""
+LOG is a .npz file, or {DEMO}, a log that comes with the program.
+Each command has a --help of its own, with an example.
+Exit codes: 0 ok, 1 ended with warnings, 2 bad input or usage, 130 interrupted."""
 
 app = App(
     name="jaxslam",
     help=HELP,
     help_format="plaintext",
-    default_parameter=Parameter(negative=(), show_default=lambda value: value is not False),
+    default_parameter=Parameter(negative=()),  # no --no-overwrite
     suppress_keyboard_interrupt=False,
 )
 simulate = App(name="simulate", help="Make a log of a simulated world, with its truth.")
 app.command(simulate)
 
-LogName = Annotated[str, Parameter(help=f"a .npz file, or the bundled log {DEMO}")]
-MovedLog = Annotated[str | None, Parameter(help="where the run's log is now, if it was moved")]
-Folder = Annotated[Path, Parameter(help="a run's folder")]
-Sensor = Annotated[
-    Literal["range_bearing", "position", "bearing"] | None,
-    Parameter(help="what the filter is given of each measurement (the first that the log has)"),
-]
-Association = Annotated[
-    Literal["maximum_likelihood", "known"],
-    Parameter(help="find out which landmark was measured, or believe the log's identities"),
-]
-Count = Annotated[int, Parameter(validator=Number(gte=1, lte=10**9))]
-Seed = Annotated[
-    int, Parameter(help="of the random draws; it makes a run repeatable", validator=Number(gte=0, lt=2**32))
-]  # fmt: skip
-ParamFile = Annotated[
-    Path | None, Parameter(help="TOML file of parameters; those it leaves out keep their default")
-]
-Paper = Annotated[
-    bool,
-    Parameter(
-        help="the paper's own rules: 2-D positions, best match for every measurement, nothing is "
-        "exclusive, clutter or forgotten"
-    ),
-]
-Overwrite = Annotated[bool, Parameter(help="replace what is there")]
-Probability = Annotated[float, Parameter(validator=Number(gte=0, lte=1))]
+
+def _option(kind, text, least=None, most=None):
+    """Type of an option: what it holds, its help, its range."""
+    shown = False if kind is bool else None  # a flag's default says nothing
+    limits = Number(gte=least, lte=most)
+    return Annotated[kind, Parameter(help=text, validator=limits, show_default=shown)]
+
+
+Seed = _option(int, "of the random draws: the same seed, the same run", 0, 2**32 - 1)
+LogName = _option(str, f"a .npz file, or {DEMO}")
+MovedLog = _option(str, "where the run's log is, if it was moved") | None
+Folder = _option(Path, "a run's folder")
+Overwrite = _option(bool, "replace what is there")
+ParamFile = _option(Path, "TOML file of parameters, for those it names") | None
+Paper = _option(bool, "the paper's rules: positions, each its best match, no clutter")
+Sensors = Literal["range_bearing", "position", "bearing"]
+Sensor = _option(Sensors, "what is used (the first that the log has)") | None
+Worlds = Literal["room", "grid", "field"]
+Associations = Literal["maximum_likelihood", "known"]
+Association = _option(Associations, "find out which landmark was measured, or believe the log")
 
 
 @app.command
 def demo(*, seed: Seed = 0):
     """Map a real room: the bundled log, ranges and bearings, identities hidden.
 
-    1,000 particles; takes about a minute; writes runs/demo, replacing an earlier demo.
+    1,000 particles, about a minute; writes runs/demo, replacing an earlier demo.
 
     Example: jaxslam demo
     """
-    from jaxslam import report
-    from jaxslam.log import load_log
-
     out = Path("runs") / "demo"
-    report.check_target(out, overwrite=True)
-    log = load_log(DEMO)
-    settings = _settings(log, "range_bearing", "maximum_likelihood", 1000, None, None, False)
-    code = _run(log, *settings, seed, out, True, DEMO)
+    code = run(DEMO, sensor="range_bearing", seed=seed, out=out, overwrite=True)
     print(f"The map is in {out / 'map.png'}")
     return code
 
@@ -90,31 +77,39 @@ def run(
     *,
     sensor: Sensor = None,
     association: Association = "maximum_likelihood",
-    particles: Annotated[Count, Parameter(help="how many hypotheses of the path")] = 1000,
-    landmarks: Annotated[
-        Count | None, Parameter(help="slots of the map (64; known: as many as identities)")
-    ] = None,
+    particles: _option(int, "how many hypotheses of the path", 1, 10**9) = 1000,
+    landmarks: _option(int, "slots of the map (64; known: one each)", 1, 10**9) | None = None,
     params: ParamFile = None,
     paper: Paper = False,
     seed: Seed = 0,
-    out: Annotated[Path | None, Parameter(help="folder to write (runs/LOG-SENSOR-SEED)")] = None,
+    out: _option(Path, "folder to write (runs/LOG-SENSOR-SEED)") | None = None,
     overwrite: Overwrite = False,
 ):
     """Filter a log: trajectory, map, figures and errors in a folder.
 
-    The folder holds map.png, error.png, particles.png, trajectory.tum, landmarks.csv,
-    summary.json, run.toml (every setting), events.jsonl and steps.npz.
+    The folder holds map.png, error.png, particles.png, trajectory.tum,
+    landmarks.csv, summary.json, run.toml (every setting), events.jsonl, steps.npz.
 
-    Example: jaxslam run lost-in-the-woods --sensor bearing --association known --out runs/woods
+    Example: jaxslam run lost-in-the-woods --sensor bearing --out runs/woods
     """
-    from jaxslam import report
-    from jaxslam.log import load_log
+    with _bar("reading"):
+        from jaxslam import report, runner
+        from jaxslam.log import load_log
 
-    loaded = load_log(log)
-    config, numbers = _settings(loaded, sensor, association, particles, landmarks, params, paper)
-    out = out or Path("runs") / f"{Path(log).stem}-{config.sensor}-{seed}"
+        loaded = load_log(log)
+    model = _model(loaded, sensor, association, particles, landmarks, params, paper)
+    out = out or Path("runs") / f"{Path(log).stem}-{model[0].sensor}-{seed}"
     report.check_target(out, overwrite)
-    return _run(loaded, config, numbers, seed, out, overwrite, log)
+    with _bar("filtering") as progress:
+        result = runner.run(loaded, *model, seed, progress)
+    with _bar("writing"):
+        report.save(result, out, overwrite, log_source=log)
+    print(report.error_table(report.summarise(result)))
+    steps = f"{len(result.time)} steps in {result.seconds:.1f} s"
+    print(f"{steps} and {result.compile_seconds:.1f} s to compile; written to {out}")
+    for line in result.flags:
+        _warn(line)
+    return int(bool(result.flags))
 
 
 @app.command
@@ -126,45 +121,46 @@ def compare(
     association: Association = "maximum_likelihood",
     params: ParamFile = None,
     paper: Paper = False,
-    particles: Annotated[str, Parameter(help="particle counts, by commas")] = "20,100",
-    steps: Annotated[Count, Parameter(help="frames to filter")] = 200,
-    every: Annotated[
-        Count | None, Parameter(help="use each n-th frame only (a tenth of the log is covered)")
-    ] = None,
+    particles: _option(str, "particle counts, by commas") = "20,100",
+    steps: _option(int, "frames to filter", 1, 10**9) = 200,
+    every: _option(int, "use each n-th frame (the steps cover a tenth)", 1, 10**9) | None = None,
     seed: Seed = 0,
 ):
     """Show the filter beside the plain NumPy baseline: agreement, accuracy, time.
 
-    Both get the same random draws. The baseline takes a second for some thousand particle steps.
+    Both get the same random draws. The baseline needs about a second for 1,000
+    steps of one particle.
 
     Example: jaxslam compare lost-in-the-woods --particles 20,100 --steps 200
     """
-    from jaxslam import compare as side_by_side
-    from jaxslam.log import load_log
-
     counts = _counts(particles)
-    loaded, rows = load_log(log), []
+    with _bar("reading"):
+        from jaxslam import compare as sides
+        from jaxslam.log import load_log
+
+        loaded = load_log(log)
+    rows = []
     for count in counts:
-        settings = _settings(loaded, sensor, association, count, None, params, paper)
+        model = _model(loaded, sensor, association, count, None, params, paper)
         with _bar(f"{count} particles") as progress:
-            rows.append(side_by_side.compare(loaded, *settings, seed, steps, every, progress))
-    print(side_by_side.table(rows))
-    for row in rows:
-        if row.double.same < row.double.steps:
-            _warn(f"the two part at step {row.double.same}, {row.double.particles} particles")
-    return int(any(row.double.same < row.double.steps for row in rows))
+            rows.append(sides.compare(loaded, *model, seed, steps, every, progress))
+    print(sides.table(rows))
+    parted = [row.double for row in rows if row.double.same < row.double.steps]
+    for row in parted:
+        _warn(f"{row.particles} particles: the two part at step {row.same}")
+    return int(bool(parted))
 
 
 @app.command(usage="Usage: jaxslam convert [OPTIONS] SRC... OUT.npz")
 def convert(
-    *paths: Annotated[Path, Parameter(help="files or folder to read, then the log to write")],
-    robot: Annotated[int | None, Parameter(help="which robot of an MRCLAM folder")] = None,
+    *paths: _option(Path, "files or folder to read, then the log to write"),
+    robot: _option(int, "which robot of an MRCLAM folder") | None = None,
     overwrite: Overwrite = False,
 ):
     """Make a log of other people's files; their format is guessed.
 
-    The course's dataset2.mat, an MRCLAM folder (with --robot), or two to four .csv files:
-    odometry, measurements, and the truth if there is any (columns: docs/log.md).
+    The course's dataset2.mat, an MRCLAM folder (with --robot), or two to four
+    .csv files: odometry, measurements, and true poses and landmarks if known.
 
     Example: jaxslam convert odometry.csv measurements.csv OUT.npz
     """
@@ -203,13 +199,7 @@ def check(log: LogName, /):
 
 
 @app.command
-def evaluate(
-    folder: Folder,
-    /,
-    *,
-    json: Annotated[bool, Parameter(help="print the errors as JSON")] = False,
-    log: MovedLog = None,
-):
+def evaluate(folder: Folder, /, *, json: _option(bool, "as JSON") = False, log: MovedLog = None):
     """Print the errors of a run against its log's truth.
 
     Example: jaxslam evaluate runs/demo --json
@@ -241,30 +231,27 @@ def plot(folder: Folder, /, *, log: MovedLog = None):
 
 @simulate.command
 def planar(
-    out: Annotated[Path, Parameter(help="the log to write, a .npz file")],
+    out: _option(Path, "the log to write, a .npz file"),
     /,
     *,
-    world: Annotated[
-        Literal["room", "grid", "field"],
-        Parameter(help="landmarks on the walls of 10 x 4 m, on a grid, or scattered"),
-    ] = "room",
+    world: _option(Worlds, "landmarks on the walls of 10 x 4 m, on a grid, or scattered") = "room",
     seed: Seed = 0,
-    landmarks: Annotated[Count, Parameter(help="point landmarks")] = 40,
-    length: Annotated[float, Parameter(help="path [m]")] = 60.0,
-    speed: Annotated[float, Parameter(help="[m/s]")] = 0.5,
-    rate: Annotated[float, Parameter(help="frames per second [Hz]")] = 5.0,
-    odometry_rate: Annotated[float, Parameter(help="odometry per second [Hz]")] = 50.0,
-    commands: Annotated[bool, Parameter(help="stop and go, no odometry but commands")] = False,
-    stop: Annotated[float, Parameter(help="between stops [m]")] = 0.3,
-    err_tran: Annotated[float, Parameter(help="noise along the path [m/sqrt(m)]")] = 0.02,
-    err_rot: Annotated[float, Parameter(help="heading, by turning [rad/sqrt(rad)]")] = 0.02,
-    err_drift: Annotated[float, Parameter(help="heading, by driving [rad/sqrt(m)]")] = 0.02,
-    sigma_range: Annotated[float, Parameter(help="noise of ranges [m]")] = 0.05,
-    sigma_bearing: Annotated[float, Parameter(help="noise of bearings [rad]")] = 0.02,
-    view_range: Annotated[float, Parameter(help="the sensor sees so far [m]")] = 5.0,
-    detection: Annotated[Probability, Parameter(help="of being seen, at range 0")] = 0.9,
-    outlier: Annotated[Probability, Parameter(help="of being clutter")] = 0.02,
-    truth_resolution: Annotated[float, Parameter(help="truth read off tiles of so many m")] = 0.0,
+    landmarks: _option(int, "point landmarks") = 40,
+    length: _option(float, "of the path [m]") = 60.0,
+    speed: _option(float, "[m/s]") = 0.5,
+    rate: _option(float, "frames per second [Hz]") = 5.0,
+    odometry_rate: _option(float, "odometry per second [Hz]") = 50.0,
+    commands: _option(bool, "stop and go: commands instead of odometry") = False,
+    stop: _option(float, "between two stops [m]") = 0.3,
+    err_tran: _option(float, "noise along the path [m/sqrt(m)]") = 0.02,
+    err_rot: _option(float, "noise of the heading, by turning [rad/sqrt(rad)]") = 0.02,
+    err_drift: _option(float, "noise of the heading, by driving [rad/sqrt(m)]") = 0.02,
+    sigma_range: _option(float, "noise of ranges [m]") = 0.05,
+    sigma_bearing: _option(float, "noise of bearings [rad]") = 0.02,
+    view_range: _option(float, "the sensor sees so far [m]") = 5.0,
+    detection: _option(float, "probability of being seen, at range 0") = 0.9,
+    outlier: _option(float, "probability of being clutter") = 0.02,
+    truth_resolution: _option(float, "truth is read off tiles of this size [m]") = 0.0,
     overwrite: Overwrite = False,
 ):
     """Simulate a drive through a planar world, drawn from the filter's own model.
@@ -298,7 +285,7 @@ def main(argv=None):
     except CycloptsError as error:
         problem = f"{error} See: jaxslam --help"
     except KeyboardInterrupt:
-        print("jaxslam: interrupted; nothing was written", file=sys.stderr)
+        print("jaxslam: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:  # whoever read the output has gone, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -308,47 +295,26 @@ def main(argv=None):
     except ValueError as error:
         problem = str(error)
     except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
-            raise
+        if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise  # a fault of ours: show where
         problem = "not enough memory; ask for fewer --particles or --landmarks"
     print(f"jaxslam: {problem.splitlines()[0]}", file=sys.stderr)
     return 2
 
 
-def _settings(log, sensor, association, particles, landmarks, params, paper):
+def _model(log, sensor, association, particles, landmarks, params, paper):
     """`Config` and `Params` as the options say."""
     from jaxslam.config import Config, default_params
     from jaxslam.paramfile import load_params
     from jaxslam.runner import config_for
 
     sizes = {"particles": particles} | ({"landmarks": landmarks} if landmarks else {})
-    sensor = sensor or ("position" if paper else None)
-    config = config_for(log, sensor, association, **sizes)
+    config = config_for(log, sensor or ("position" if paper else None), association, **sizes)
     if paper:
-        config = Config.paper(
-            particles, config.landmarks, config.measurements,
-            sensor=config.sensor, association=association,
-        )  # fmt: skip
+        sizes = config.particles, config.landmarks, config.measurements
+        config = Config.paper(*sizes, sensor=config.sensor, association=association)
     base = default_params(config.sensor, log)
     return config, load_params(params, base) if params else base
-
-
-def _run(log, config, params, seed, out, overwrite, source):
-    """Filter, save and report; returns the exit code."""
-    import json
-
-    from jaxslam import report, runner
-
-    with _bar("filtering") as progress:
-        result = runner.run(log, config, params, seed, progress)
-    with _bar("writing"):
-        report.save(result, out, overwrite, log_source=source)
-    print(report.error_table(json.loads((out / "summary.json").read_text(encoding="utf-8"))))
-    steps = f"{len(result.time)} steps in {result.seconds:.1f} s"
-    print(f"{steps} and {result.compile_seconds:.1f} s to compile; written to {out}")
-    for line in result.flags:
-        _warn(line)
-    return int(bool(result.flags))
 
 
 @contextmanager

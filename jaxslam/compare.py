@@ -135,6 +135,43 @@ def select(log, kept):
     )
 
 
+def table(comparisons):
+    """Text: one column per `Comparison`."""
+    rows = [
+        ("", "{0.particles} particles"),
+        ("float64: decisions alike", "{0.same} of {0.steps} steps"),
+        ("  largest difference, poses", "{0.pose:.1e} m, rad"),
+        ("  log weights", "{0.log_weight:.1e}"),
+        ("  landmarks at the end", "{0.landmarks:.1e}"),
+        ("  resampled", "{0.resampled} steps"),
+        ("  landmarks born, forgotten", "{0.born:.1f}, {0.freed:.1f}"),
+        ("float32: decisions alike", "{1.same} of {1.steps} steps"),
+        ("  largest difference, poses", "{1.pose:.1e} m, rad"),
+        ("path error, baseline", "{2.ate_baseline:.3f} m RMSE"),
+        ("path error, filter", "{2.ate_filter:.3f} m RMSE"),
+        ("time per step, baseline", "{3[0]:.4g} ms"),
+        ("  filter, first run, compiling", "{3[1]:.4g} ms"),
+        ("  filter", "{3[2]:.4g} ms"),
+        ("  baseline / filter, compiling", "{3[3]:.4g} times"),
+        ("  baseline / filter", "{3[4]:.4g} times"),
+    ]
+    lines = []
+    for name, cell in rows:
+        cells = [cell.format(row.double, row.single, row, _times(row)) for row in comparisons]
+        lines.append(f"{name:32}" + "".join(f"{text:>20}" for text in cells))
+    return "\n".join(lines)
+
+
+def _times(row):
+    """Milliseconds per step of baseline, compiling filter and filter, and the two ratios."""
+    both = row.double, row.single  # the baseline is the same in both
+    slow = sum(part.seconds_baseline for part in both) / 2
+    fast = row.single.seconds_filter
+    first = fast + row.single.compile_seconds
+    per_step = [1e3 * seconds / row.single.steps for seconds in (slow, first, fast)]
+    return *per_step, slow / first, slow / fast
+
+
 class _Trace(NamedTuple):
     """Every step's poses [T, 3, N], log weights [T, N], ancestors [T, N], matches [T, K, N] and
     mean pose [T, 3]."""
@@ -164,13 +201,15 @@ def _run_filter(data, config, params, seed, start, log):
     begin = time.perf_counter()
     steps = _steps.lower(key, state, *given, config).compile()
     compiled = time.perf_counter()
+    jax.block_until_ready(steps(key, state, *given))  # to warm up
+    begin, compiled = time.perf_counter(), compiled - begin
     final, trace = jax.block_until_ready(steps(key, state, *given))
-    done = time.perf_counter()
+    ran = time.perf_counter() - begin
     numbers = jnp.arange(len(data.time), dtype=jnp.int32)
     normals, uniforms = jax.vmap(lambda step: fastslam.draws(key, step, config))(numbers)
     draws = fastslam.start_draws(key, config), normals, uniforms
     host = [jax.tree.map(np.asarray, tree) for tree in (final, trace, draws)]
-    return *host, compiled - begin, done - compiled
+    return *host, compiled, ran
 
 
 def _differences(state, trace, reference):

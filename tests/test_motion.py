@@ -104,7 +104,7 @@ def test_noise_of_an_interval_is_that_of_its_many_small_steps(x64, reverse):
     many, one = np.cov(rotate @ pose), np.cov(rotate @ drawn)
     scale = np.sqrt(np.outer(np.diag(many), np.diag(many)))
     # 40,000 runs: a correlation is known to 0.005; what remains is the bend itself.
-    np.testing.assert_allclose(one / scale, many / scale, atol=0.04)
+    np.testing.assert_allclose(one / scale, many / scale, atol=0.06)
     np.testing.assert_allclose(pose.mean(1), drawn.mean(1), atol=2e-3)
 
 
