@@ -60,16 +60,16 @@ class Comparison(NamedTuple):
 
 
 def compare(log, config, params=None, seed=0, steps=200, every=None, progress=None):
-    """`Comparison` over the first `steps` frames, of which each `every`-th is used.
+    """`Comparison` over `steps` of the log's frames, every `every`-th from the first on.
 
-    `every`: None for a tenth of the log, or all frames if the log is short. `progress`: called with
-    (what, done, total).
+    `every`: None to cover a tenth of the log, or as much as there is. `progress`: as for
+    `agreement`, which is run in float64 and in float32.
     """
     if every is None:
         every = max(1, len(log.frame_time) // (10 * steps))
     log = select(log, np.arange(0, len(log.frame_time), every)[:steps])
-    double = agreement(log, config, params, seed, steps, True, _named(progress, "float64"))
-    single = agreement(log, config, params, seed, steps, False, _named(progress, "float32"))
+    double = agreement(log, config, params, seed, steps, True, progress)
+    single = agreement(log, config, params, seed, steps, False, progress)
     true = truth_at(log.truth, log.frame_time)
     errors = [ate(p, true, align=False)[0] for p in (single.pose_baseline, single.pose_filter)]
     return Comparison(double, single, *errors)
@@ -249,7 +249,3 @@ def _map_difference(world, particles):
             for mine, other in pairs:
                 largest = max(largest, float(np.abs(mine[:, slot, i] - other).max()))
     return largest
-
-
-def _named(progress, what):
-    return progress and partial(progress, what)

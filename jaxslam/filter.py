@@ -101,14 +101,23 @@ def draws(key, step, config):
 @partial(jax.jit, static_argnames="config")
 def step(key, state, odometry, measurements, params, config):
     """One step: move, associate and weigh, update, resample. Returns (State, Info)."""
-    normals, uniform = draws(key, state.step, config)
+    chance = draws(key, state.step, config)
+    return advance(chance, state, odometry, measurements, params, config)
+
+
+def advance(chance, state, odometry, measurements, params, config):
+    """`step` with its random numbers given: `chance` is the (normals, uniform) of `draws`."""
+    normals, uniform = chance
     pose = jnp.stack(motion.sample(state.pose, odometry, params, normals))
     world, density, match, counts = _observe(
         pose, state.landmarks, measurements, params, config, state.step
     )
+    # A pose that is not a number fits nothing, which would count as new landmarks: no weight.
+    sound = jnp.isfinite(pose).all(0)
+    density = jnp.where(sound, density, jnp.nan)
     log_weight, log_evidence, flags = _weigh(state.log_weight, density)
     weight = jnp.exp(log_weight)
-    estimate = _estimate(pose, weight)
+    estimate = _estimate(jnp.where(sound, pose, 0), weight)
     ess = 1 / jnp.sum(weight**2)
     threshold = config.resample_threshold
     wanted = measurements.active & ((ess < threshold * config.particles) | (threshold >= 1))

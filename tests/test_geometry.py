@@ -67,7 +67,7 @@ def _principal(cov):
 @pytest.mark.parametrize("sigma", [5e-4, 2e-3, 2e-2, 0.1])
 @pytest.mark.parametrize("prior", [1.0, 30.0, 1000.0])
 def test_square_root_update_in_single_precision_against_double(sigma, prior):
-    """A range and a bearing of `sigma` on a landmark known to `prior` metres: what float32 keeps."""
+    """A range and a bearing of `sigma` on a landmark known to `prior` m: what float32 keeps."""
     rng = np.random.default_rng(int(prior) + int(1e4 * sigma))
     for _ in range(200):
         angle, r, tilt = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 20), rng.uniform(-0.9, 0.9)
