@@ -1,0 +1,45 @@
+"""Bearing-only FastSLAM as a JAX-vectorised filter.
+
+    log = jaxslam.load_log("lost-in-the-woods")
+    result = jaxslam.run(log, seed=0)
+    result.save("runs/woods")
+
+Names are looked up when first used, so that `import jaxslam` does not import JAX.
+"""
+
+import importlib
+
+_WHERE = {
+    "Config": "config",
+    "Params": "config",
+    "default_params": "config",
+    "load_params": "paramfile",
+    "save_params": "paramfile",
+    "Log": "log",
+    "Truth": "log",
+    "FloorPlan": "log",
+    "load_log": "log",
+    "save_log": "log",
+    "read": "readers",
+    "config_for": "runner",
+    "run": "runner",
+    "Result": "runner",
+    "init": "filter",
+    "step": "filter",
+    "State": "filter",
+    "Info": "filter",
+    "errors": "evaluate",
+    "planar": "simulate",
+}
+__version__ = "0.1.0"
+__all__ = sorted(_WHERE)
+
+
+def __getattr__(name):
+    if name not in _WHERE:
+        raise AttributeError(f"module 'jaxslam' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"jaxslam.{_WHERE[name]}"), name)
+
+
+def __dir__():
+    return sorted([*globals(), *_WHERE])

@@ -59,7 +59,9 @@ def _maximum_likelihood(config, scorer, measurements, threshold, params):
         better = density > best[0]
         return jnp.where(better, density, best[0]), jnp.where(better, m, best[1])
 
-    best = jax.lax.fori_loop(0, slots, look, start)
+    # Slots are filled from the lowest: beyond the highest one in use there is nothing to look at.
+    used = jnp.max(jnp.where(scorer.constant > -jnp.inf, jnp.arange(slots)[:, None] + 1, 0))
+    best = jax.lax.fori_loop(0, used, look, start)
     if not config.exclusive:
         return best[1]
     return _settle(config, scorer, measurements, threshold, params, best)

@@ -66,10 +66,7 @@ def demo(*, seed: Seed = 0):
 
     Example: jaxslam demo
     """
-    out = Path("runs") / "demo"
-    code = run(DEMO, sensor="range_bearing", seed=seed, out=out, overwrite=True)
-    print(f"The map is in {out / 'map.png'}")
-    return code
+    return run(DEMO, sensor="range_bearing", seed=seed, out=Path("runs/demo"), overwrite=True)
 
 
 @app.command
@@ -107,8 +104,8 @@ def run(
     with _bar("writing"):
         report.save(result, out, overwrite, log_source=log)
     print(report.error_table(report.summarise(result)))
-    steps = f"{len(result.time)} steps in {result.seconds:.1f} s"
-    print(f"{steps} and {result.compile_seconds:.1f} s to compile; written to {out}")
+    spent = f"{result.seconds:.1f} s, and {result.compile_seconds:.1f} s to compile"
+    print(f"{len(result.time)} steps in {spent}\n{out}: the map is {out / 'map.png'}")
     for line in result.flags:
         _warn(line)
     return int(bool(result.flags))
@@ -187,8 +184,6 @@ def convert(
 def check(log: LogName, /):
     """Say what is in a log and what looks wrong: counts, rates, gaps, lost rows, units.
 
-    Exit code 0: all is well, 1: warnings, 2: errors.
-
     Example: jaxslam check OUT.npz
     """
     from jaxslam import check as examine
@@ -213,7 +208,6 @@ def evaluate(folder: Folder, /, *, json: _option(bool, "as JSON") = False, log: 
 
         errors = report.evaluate_folder(folder, log)
     print(dumps(errors, indent=2) if json else report.error_table(errors))
-    return 0
 
 
 @app.command
@@ -228,7 +222,6 @@ def plot(folder: Folder, /, *, log: MovedLog = None):
         paths = plot_folder(folder, log)
     for path in paths:
         print(path)
-    return 0
 
 
 @simulate.command
@@ -274,20 +267,21 @@ def planar(
         )  # fmt: skip
     save_log(out, log)
     print(f"{out}: {log}")
-    return 0
 
 
 def main(argv=None):
     """Run one command (None: the process's arguments); returns the exit code."""
-    argv = sys.argv[1:] if argv is None else argv
     try:
-        code = app(argv, exit_on_error=False, print_error=False, result_action="return_value")
+        tokens = sys.argv[1:] if argv is None else argv
+        code = app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
         sys.stdout.flush()
         return code or 0
     except CycloptsError as error:
         problem = f"{error} See: jaxslam --help"
     except KeyboardInterrupt:
-        print("jaxslam: interrupted", file=sys.stderr)
+        print("jaxslam: interrupted", file=sys.stderr, flush=True)
+        if argv is None:  # at once: stopped while compiling, JAX would crash as Python winds down
+            os._exit(130)
         return 130
     except BrokenPipeError:  # whoever read the output has gone, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -300,7 +294,7 @@ def main(argv=None):
         if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise  # a fault of ours: show where
         problem = "not enough memory; ask for fewer --particles or --landmarks"
-    print(f"jaxslam: {problem.splitlines()[0]}", file=sys.stderr)
+    print("jaxslam:", problem.split("\n")[0], file=sys.stderr)
     return 2
 
 
@@ -325,10 +319,9 @@ def _bar(what):
     if not sys.stderr.isatty():
         yield None
         return
-    from rich.console import Console
-    from rich.progress import Progress
+    from rich import console, progress
 
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    with progress.Progress(console=console.Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=None)
 
         def show(done, total):
@@ -339,14 +332,9 @@ def _bar(what):
 
 
 def _counts(text):
-    try:
-        counts = [int(count) for count in text.split(",")]
-    except ValueError:
-        counts = [0]
+    counts = [int(count) if count.isdecimal() else 0 for count in text.split(",")]
     if min(counts) < 1:
-        raise ValueError(
-            f"--particles is {text!r}; must be whole numbers from 1, by commas: 20,100"
-        )
+        raise ValueError(f"--particles is {text!r}; must be whole numbers from 1, like 20,100")
     return counts
 
 

@@ -90,7 +90,8 @@ def agreement(log, config, params=None, seed=0, steps=None, double=True, progres
     if progress:
         progress(0, len(data.time))
     # The runner's local origin: float32 has 7 digits.
-    start = log.start_pose - np.array([*log.start_pose[:2], 0.0])
+    origin = np.array([*log.start_pose[:2], 0.0])
+    start = log.start_pose - origin
     with jax.enable_x64(double):
         state, trace, draws, compiled, ran = _run_filter(data, config, params, seed, start, log)
     begin = time.perf_counter()
@@ -99,7 +100,6 @@ def agreement(log, config, params=None, seed=0, steps=None, double=True, progres
         progress=progress,
     )  # fmt: skip
     spent = time.perf_counter() - begin
-    shift = np.array([*log.start_pose[:2], 0.0])
     return Agreement(
         len(data.time),
         config.particles,
@@ -109,8 +109,8 @@ def agreement(log, config, params=None, seed=0, steps=None, double=True, progres
         freed=float(reference.freed.sum() / config.particles),
         overflow=float(reference.overflow.sum() / config.particles),
         clutter=float((reference.match == baseline.CLUTTER).sum() / config.particles),
-        pose_baseline=reference.pose_mean + shift,
-        pose_filter=trace.mean + shift,
+        pose_baseline=reference.pose_mean + origin,
+        pose_filter=trace.mean + origin,
         seconds_baseline=spent,
         seconds_filter=ran,
         compile_seconds=compiled,
@@ -223,9 +223,10 @@ def _differences(state, trace, reference):
     pose = (trace.pose - reference.poses)[:same]
     pose[:, 2] = wrap(pose[:, 2])
     weight, other = trace.log_weight[:same], reference.log_weight[:same]
-    apart = np.where(weight == other, 0.0, np.abs(weight - np.where(weight == other, 0, other)))
+    apart = np.zeros(weight.shape)  # also where both are -inf
+    np.subtract(weight, other, out=apart, where=weight != other)
     far = _map_difference(state.landmarks, reference.particles) if same == total else np.nan
-    return same, float(np.abs(pose).max()), float(apart.max()), far
+    return same, float(np.abs(pose).max()), float(np.abs(apart).max()), far
 
 
 def _map_difference(world, particles):

@@ -36,7 +36,7 @@ class Config:
     clutter: bool = True
     forgetting: bool | None = None
     proposal: str = "prior"
-    block: int = 256
+    block: int = 512
 
     def __post_init__(self):
         for name, allowed in (
@@ -155,9 +155,9 @@ _DEFAULTS = Params(
     gain_tran=1.0,
     gain_rot=1.0,
     bias_drift=0.0,
-    sigma_range=0.1,
-    sigma_bearing=0.03,
-    growth=0.04,
+    sigma_range=0.12,
+    sigma_bearing=0.05,
+    growth=0.12,
     position_scale=1.0,
     mount_x=0.0,
     mount_y=0.0,

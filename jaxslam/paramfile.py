@@ -66,7 +66,7 @@ def _ranges(v):
     """For each bounded name: whether its value is allowed, and what is."""
     ranges = {name: (v[name] > 0, f"above 0 {UNITS[name]}") for name in ABOVE_ZERO}
     ranges |= {name: (v[name] >= 0, f"0 {UNITS[name]} or more") for name in AT_LEAST_ZERO}
-    low, high, pi = v["view_min"], v["view_max"], math.pi + 1e-9
+    low, high, pi = v["view_min"], v["view_max"], math.pi + 1e-6  # float32 rounds it up
     most = v["existence_max"]
     return ranges | {
         "outlier": (0 <= v["outlier"] < 1, "a probability, from 0 to below 1"),

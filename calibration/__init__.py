@@ -1,0 +1,1 @@
+"""What is fitted once, offline, and handed to the filter as `Params`."""

@@ -1,0 +1,144 @@
+"""The filter against the baseline, fed the same draws; and the comparison itself."""
+
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import baseline, compare, simulate
+from jaxslam.config import ASSOCIATIONS, SENSORS, Config, default_params
+from jaxslam.log import load_log
+
+STEPS, PARTICLES = 200, 20
+# More than one block, a map that can fill up, and frames with more measurements than slots.
+SIZES = {"particles": PARTICLES, "measurements": 4, "landmarks": 20, "block": 10}
+
+
+@pytest.fixture(scope="module")
+def woods():
+    """Two minutes of the bundled log: the robot starts, drives and turns."""
+    log = load_log("lost-in-the-woods")
+    return compare.select(log, np.arange(0, 6 * STEPS, 6))
+
+
+def assert_agree(log, config):
+    params = default_params(config.sensor, log)
+    # Short-lived landmarks, so that some are forgotten and found anew.
+    params = params._replace(existence_new=0.3, existence_seen=0.2, existence_miss=0.5)
+    found = compare.agreement(log, config, params, seed=1)
+    assert found.same == found.steps == STEPS
+    assert max(found.pose, found.log_weight, found.landmarks) <= 1e-9
+    assert found.resampled >= 10
+    assert found.born >= 5
+    assert found.freed >= 1 or not config.forgetting
+    assert jnp.ones(1).dtype == jnp.float32  # float64 was not left switched on
+    return found
+
+
+@pytest.mark.parametrize("association", ASSOCIATIONS)
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_baseline_and_filter_agree(woods, sensor, association):
+    config = Config(sensor=sensor, association=association, forgetting=True, **SIZES)
+    found = assert_agree(woods, config)
+    assert found.clutter > 0 or association == "maximum_likelihood"
+
+
+def test_baseline_and_filter_agree_on_the_papers_rules(woods):
+    found = assert_agree(woods, Config.paper(**SIZES))
+    assert found.freed == found.clutter == 0
+
+
+def small(steps=12):
+    log = simulate.planar(length_m=steps * 0.1, landmarks=12, outlier=0.2, seed=3)
+    return log, Config(particles=4, measurements=4, landmarks=3)
+
+
+def test_comparison_in_both_precisions():
+    log, config = small()
+    calls = []
+    row = compare.compare(log, config, steps=10, progress=lambda *call: calls.append(call))
+    assert row.double.same == row.single.same == row.double.steps == 10
+    assert row.double.landmarks <= 1e-12 < row.single.landmarks <= 1e-3
+    assert row.double.overflow > 0  # three slots were too few, and both lost the same landmarks
+    assert 0 < row.ate_baseline < 1
+    assert row.ate_filter == pytest.approx(row.ate_baseline, abs=1e-5)
+    assert min(row.double.seconds_baseline, row.single.seconds_filter) > 0
+    assert calls[0] == (0, 10)
+    assert calls[-1] == (10, 10)
+    text = compare.table([row, row])
+    assert "10 of 10 steps" in text
+    assert len({len(line) for line in text.splitlines()}) == 1
+
+
+def traces(steps=3, particles=2):
+    """A trace and a baseline's result that agree, and a map of one landmark each."""
+    pose = np.zeros((steps, 3, particles))
+    weight = np.full((steps, particles), -np.log(2.0))
+    weight[1, 1] = -np.inf
+    ancestors = np.tile(np.arange(particles), (steps, 1))
+    match = np.zeros((steps, 1, particles), int)
+    trace = compare._Trace(pose, weight, ancestors, match, pose[:, :, 0])
+    mark = SimpleNamespace(
+        mean=[1.0, 2.0], cov=[[4.0, 2.0], [2.0, 10.0]], count=3, birth=0, log_odds=1.0
+    )
+    reference = SimpleNamespace(
+        poses=pose.copy(),
+        log_weight=weight.copy(),
+        ancestors=ancestors.copy(),
+        match=np.swapaxes(match, 1, 2).copy(),
+        particles=[SimpleNamespace(landmarks=[mark, None])] * particles,
+    )
+    world = SimpleNamespace(
+        mean=np.tile([[[1.0], [0.0]], [[2.0], [0.0]]], particles),
+        factor=np.tile([[[2.0], [0.0]], [[1.0], [0.0]], [[3.0], [0.0]]], particles),
+        anchor=None,
+        log_odds=np.tile([[1.0], [0.0]], particles),
+        count=np.tile([[3], [0]], particles),
+        birth=np.zeros((2, particles), int),
+    )
+    return SimpleNamespace(landmarks=world), trace, reference
+
+
+def test_differences_of_equal_runs_are_zero():
+    assert compare._differences(*traces()) == (3, 0.0, 0.0, 0.0)
+
+
+def test_differences_stop_where_the_decisions_part():
+    state, trace, reference = traces()
+    reference.match[2, 1, 0] = baseline.NEW
+    reference.poses[1, 2, 0] += 2 * np.pi + 0.25  # a full turn is no difference
+    reference.poses[2] += 5
+    same, pose, _, landmarks = compare._differences(state, trace, reference)
+    assert (same, np.isnan(landmarks)) == (2, True)
+    assert pose == pytest.approx(0.25)
+    reference.ancestors[0, 0] = 1
+    assert compare._differences(state, trace, reference)[0] == 0
+
+
+@pytest.mark.parametrize("name", ["mean", "factor", "birth", "log_odds"])
+def test_every_number_of_a_landmark_counts(name):
+    state, trace, reference = traces()
+    getattr(state.landmarks, name)[..., 0, 1] += 1
+    assert compare._differences(state, trace, reference)[3] >= 1
+
+
+def test_different_sets_of_landmarks_are_infinitely_apart():
+    state, trace, reference = traces()
+    state.landmarks.count[1, 1] = 1
+    assert compare._differences(state, trace, reference)[3] == np.inf
+
+
+def test_selected_frames_keep_their_measurements():
+    log = simulate.planar(length_m=3.0, seed=2)
+    kept = np.arange(1, len(log.frame_time), 3)
+    part = compare.select(log, kept)
+    assert np.array_equal(part.frame_time, log.frame_time[kept])
+    assert part.start == log.start  # the odometry is all there
+    for new, old in enumerate(kept):
+        for name in ("bearing", "range", "identity"):
+            mine = getattr(part, name)[part.frame == new]
+            assert np.array_equal(mine, getattr(log, name)[log.frame == old])
+        assert np.array_equal(
+            part.truth.identity[part.frame == new], log.truth.identity[log.frame == old]
+        )
