@@ -15,17 +15,13 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
 
-from jaxslam.config import default_params
+from calibration.likelihood import maximum_likelihood
+from calibration.odometry import GAP, LEAST, ODOMETRY, fit_odometry, require
 from jaxslam.evaluate import truth_at, wrap
-from jaxslam.frames import increments
 
-LEAST = 30  # measurements, and intervals of odometry, below which nothing is estimated
 COARSEST = 0.02  # m; truth read off anything coarser tells nothing of these errors
-GAP = 0.25  # s between two true poses, across which a pose may be interpolated
 OUTLIER = 5.0  # robust standard deviations
-ODOMETRY = ("gain_tran", "gain_rot", "bias_drift", "err_tran", "err_rot", "err_drift")
 
 
 class RangeBin(NamedTuple):
@@ -68,12 +64,14 @@ def fit(log, interval=1.0):
     `err_rot`, `err_drift`, `gain_tran`, `gain_rot`, `bias_drift`; the floors and the mounting's x
     and y stay as the log declares them. Raises `ValueError` naming what the log lacks.
     """
+    if not 0 < interval < np.inf:
+        raise ValueError(f"interval: {interval!r} s; must be above 0")
     truth = log.truth
-    _require(log, truth is not None and truth.time is not None, "true poses")
+    require(log, truth is not None and truth.time is not None, "true poses")
     fine = f"true poses finer than {COARSEST:g} m (they have {truth.resolution:g} m)"
-    _require(log, truth.resolution <= COARSEST, fine)
+    require(log, truth.resolution <= COARSEST, fine)
     values, errors, counts, by_range = _fit_sensor(log)
-    (*best, drive_yaw), (*error, yaw_error), counts["intervals"] = _fit_odometry(log, interval)
+    (*best, drive_yaw), (*error, yaw_error), counts["intervals"] = fit_odometry(log, interval)
     values |= zip(ODOMETRY, best, strict=True)
     errors |= zip(ODOMETRY, error, strict=True)
     values, errors = ({k: float(v) for k, v in part.items()} for part in (values, errors))
@@ -90,11 +88,6 @@ def turn_frame(log, yaw):
     return replace(log, mounting=mounting, start_pose=log.start_pose + turn, truth=truth)
 
 
-def _require(log, met, what):
-    if not met:
-        raise ValueError(f"{log.name}: calibration needs {what}; this log lacks them")
-
-
 def _fit_sensor(log):
     """Values, standard errors, counts and bins of the measurements' residuals."""
     r, residual, clutter = _residuals(log)
@@ -107,7 +100,7 @@ def _fit_sensor(log):
     bearing, off = residual[~far].T
     shape = np.column_stack([np.ones_like(bearing), r[~far] ** -2.0])  # of the bearing's variance
     start = [np.median(bearing), np.var(bearing) / 2, np.var(bearing) / 2 / shape[:, 1].mean()]
-    best, error = _maximum_likelihood(
+    best, error = maximum_likelihood(
         lambda p: ((bearing - p[0])[:, None], (shape @ p[1:])[:, None, None]), start, [1, 2]
     )
     counts = {"measurements": len(r) + clutter, "outliers": int(far.sum()) + clutter}
@@ -134,16 +127,16 @@ def _fit_sensor(log):
 def _residuals(log):
     """True ranges [n], residuals [n, 2] (bearing, range) of known landmarks, number of clutter."""
     truth = log.truth
-    _require(log, truth.landmarks is not None and truth.landmark_id is not None, "true landmarks")
-    _require(log, log.bearing is not None, "bearings")
+    require(log, truth.landmarks is not None and truth.landmark_id is not None, "true landmarks")
+    require(log, log.bearing is not None, "bearings")
     identity = log.identity if truth.identity is None else truth.identity
-    _require(log, identity is not None, "identities of the measurements")
+    require(log, identity is not None, "identities of the measurements")
     slots = {landmark: i for i, landmark in enumerate(truth.landmark_id.tolist())}
     slot = np.array([slots.get(i, -1) for i in identity.tolist()], int)
     pose = truth_at(truth, log.frame_time, GAP)[log.frame]
     posed = np.isfinite(pose).all(1)
     known = posed & (slot >= 0)
-    _require(log, known.sum() >= LEAST, f"at least {LEAST} measurements of known landmarks")
+    require(log, known.sum() >= LEAST, f"at least {LEAST} measurements of known landmarks")
     x, y, heading = pose[known].T
     mx, my, yaw = log.mounting
     c, s = np.cos(heading), np.sin(heading)
@@ -154,92 +147,3 @@ def _residuals(log):
     # A measured identity of -1 may be anything; a true one is clutter.
     clutter = 0 if truth.identity is None else int((posed & (identity < 0)).sum())
     return r, np.column_stack([bearing, off]), clutter
-
-
-def _fit_odometry(log, interval):
-    """Values and standard errors of `ODOMETRY` and of the drive's yaw; the number of intervals."""
-    o, before, after = _intervals(log, interval)
-    enough = o.distance.sum() >= 1 and o.turn.sum() >= 1
-    _require(log, enough, "odometry with at least 1 m driven and 1 rad turned, where truth is")
-    declared = default_params("bearing", log)
-    floors = declared.floor_tran**2 * o.duration, declared.floor_rot**2 * o.duration
-    best, error = _maximum_likelihood(
-        lambda p: motion_residuals(p, o, before, after, floors),
-        [1, 1, 0, 0.02**2, 0.02**2, 0.02**2, 0],
-        [3, 4, 5],
-    )
-    return best.tolist(), error.tolist(), len(o.dx)
-
-
-def _intervals(log, interval):
-    """`Odometry` of intervals between true poses [n], and the poses [n, 3] at their two ends."""
-    moving = log.odometry_time
-    # A command is executed at its stamp: in between there is no saying how far it got.
-    stamps = log.truth.time if log.odometry_kind == "velocity" else moving
-    pose = truth_at(log.truth, stamps, GAP)
-    usable = np.isfinite(pose).all(1) & (stamps >= moving[0]) & (stamps <= moving[-1])
-    stamps, pose, ends, end = stamps[usable], pose[usable], [], 0
-    while end < len(stamps):
-        ends.append(end)
-        end = np.searchsorted(stamps, stamps[end] + int(interval * 1e9))
-    _require(log, len(ends) > LEAST, f"over {LEAST} s of odometry and true poses together")
-    stamps, pose = stamps[ends], pose[ends]
-    bare = dict.fromkeys(("range", "point", "point_cov", "identity", "descriptor", "truth"))
-    bare |= {"frame": np.empty(0, int), "bearing": np.empty(0)}
-    odometry = increments(replace(log, frame_time=stamps, **bare))
-    length = np.diff(stamps)
-    kept = length <= 2 * max(interval * 1e9, np.median(length))  # not across a hole in the truth
-    return type(odometry)(*(leaf[1:][kept] for leaf in odometry)), pose[:-1][kept], pose[1:][kept]
-
-
-def motion_residuals(p, o, before, after, floors):
-    """Errors [n, 3] along, across and in heading, and covariances [n, 3, 3], as `motion.model`.
-
-    `p`: gains (translation, rotation), drift's bias, squares of err_tran, err_rot and err_drift,
-    and the drive's yaw.
-    """
-    gain_tran, gain_rot, bias, tran, rot, drift, yaw = p
-    length = gain_tran * np.hypot(o.dx, o.dy)
-    bend = o.lever * (gain_rot - 1) * o.dtheta + bias * o.distance / 2
-    chord = before[:, 2] + yaw + np.arctan2(o.dy, o.dx) + bend
-    dx, dy = (after - before)[:, :2].T
-    c, s = np.cos(chord), np.sin(chord)
-    turned = wrap(after[:, 2] - before[:, 2] - gain_rot * o.dtheta - bias * o.distance)
-    drifted, spun = drift * o.distance + floors[1], rot * o.turn
-    cov = np.zeros((len(dx), 3, 3))
-    cov[:, 0, 0] = tran * o.distance + floors[0]
-    cov[:, 1, 1] = length**2 * (drifted / 3 + (o.lever**2 + o.lever_var) * spun) + floors[0]
-    cov[:, 1, 2] = cov[:, 2, 1] = length * (drifted / 2 + o.lever * spun)
-    cov[:, 2, 2] = drifted + spun
-    return np.column_stack([c * dx + s * dy - length, c * dy - s * dx, turned]), cov
-
-
-def _maximum_likelihood(moments, start, squares):
-    """Parameters and standard errors that fit normal residuals of mean zero best.
-
-    `moments(p)`: residuals [n, d] and covariances [n, d, d]. Of the variances among the parameters,
-    listed in `squares`, the roots come back. Errors are by Fisher's information.
-    """
-    scale = np.full(len(start), 0.01)
-    scale[squares] = np.array(start)[squares]
-    bounds = [(1e-8 if i in squares else None, None) for i in range(len(start))]
-
-    def cost(q):
-        e, cov = moments(q * scale)
-        white = np.linalg.solve(cov, e[..., None])[..., 0]
-        return (np.sum(e * white) + np.linalg.slogdet(cov)[1].sum()) / (2 * len(e))
-
-    best = minimize(cost, np.array(start) / scale, method="L-BFGS-B", bounds=bounds).x * scale
-    inverse, slopes = np.linalg.inv(moments(best)[1]), []
-    for step in np.diag(1e-4 * scale):
-        ends = zip(moments(best + step), moments(best - step), strict=True)
-        slopes.append([(a - b) / (2 * step.sum()) for a, b in ends])
-    means, covs = zip(*slopes, strict=True)
-    white = [inverse @ cov for cov in covs]
-    information = np.array([[np.einsum("na,nab,nb", d, inverse, e) for e in means] for d in means])
-    information += [[np.einsum("nab,nba", a, b) / 2 for b in white] for a in white]
-    error = np.sqrt(np.diag(np.linalg.pinv(information)))
-    best[squares] = np.sqrt(best[squares])
-    # Next to zero the root is no straight line: what is known is how far up it may go.
-    error[squares] = np.minimum(error[squares] / (2 * best[squares]), np.sqrt(error[squares]))
-    return best, error

@@ -177,12 +177,15 @@ _DEFAULTS = Params(
     existence_confirm=5.0,
 )
 
+# Bearings alone drag a wrong depth along: they need to be believed less.
+_OF_SENSOR = {"bearing": dict(sigma_bearing=0.08, growth=0.1, outlier=1e-3)}
+
 
 def default_params(sensor="range_bearing", log=None):
     """Default `Params` of a sensor, with what the log declares: mounting, view and noise."""
     if sensor not in SENSORS:
         raise ValueError(f"sensor: {sensor!r} is not one of {', '.join(SENSORS)}")
-    params = _DEFAULTS
+    params = _DEFAULTS._replace(**_OF_SENSOR.get(sensor, {}))
     if log is None:
         return params
     names = ("mount_x", "mount_y", "mount_yaw", "view_min", "view_max", "view_range")

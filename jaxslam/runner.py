@@ -14,6 +14,7 @@ from jaxslam import landmarks as maps
 from jaxslam.config import Config, Params, default_params
 from jaxslam.frames import dead_reckoning, frames
 from jaxslam.log import Log
+from jaxslam.paramfile import validate
 
 CHUNK = 256  # frames per compiled scan: one compilation serves logs of every length
 
@@ -137,6 +138,7 @@ def run(log, config=None, params=None, seed=0, progress=None):
     """
     config = config_for(log) if config is None else config
     params = default_params(config.sensor, log) if params is None else params
+    params = validate(params, "params")
     known = config.association == "known"
     data = frames(log, config.sensor, config.measurements, params, known)
     total = len(data.time)
@@ -146,7 +148,7 @@ def run(log, config=None, params=None, seed=0, progress=None):
     origin = np.array([*log.start_pose[:2], 0.0])
     key = jax.random.key(seed)
     state = fastslam.init(config, key, log.start_pose - origin, log.start_cov)
-    numbers = jax.tree.map(jnp.asarray, Params(*map(float, params)))
+    numbers = jax.tree.map(jnp.asarray, params)
     chunks = _chunks(data, config)
     begin = time.perf_counter()
     steps = _scan.lower(key, state, *next(iter(chunks)), numbers, config).compile()
@@ -164,7 +166,7 @@ def run(log, config=None, params=None, seed=0, progress=None):
     return Result(
         log=log,
         config=config,
-        params=Params(*map(float, params)),
+        params=params,
         seed=seed,
         time=data.time,
         pose=summary.pose + origin,

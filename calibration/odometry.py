@@ -1,0 +1,77 @@
+"""The odometry's part of the error model: increments against true poses."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from calibration.likelihood import maximum_likelihood
+from jaxslam.config import default_params
+from jaxslam.evaluate import truth_at, wrap
+from jaxslam.frames import increments
+
+LEAST = 30  # measurements, and intervals of odometry, below which nothing is estimated
+GAP = 0.25  # s between two true poses, across which a pose may be interpolated
+ODOMETRY = ("gain_tran", "gain_rot", "bias_drift", "err_tran", "err_rot", "err_drift")
+
+
+def require(log, met, what):
+    if not met:
+        raise ValueError(f"{log.name}: calibration needs {what}; this log lacks them")
+
+
+def fit_odometry(log, interval):
+    """Values and standard errors of `ODOMETRY` and of the drive's yaw; the number of intervals."""
+    o, before, after = _intervals(log, interval)
+    enough = o.distance.sum() >= 1 and o.turn.sum() >= 1
+    require(log, enough, "odometry with at least 1 m driven and 1 rad turned, where truth is")
+    declared = default_params("bearing", log)
+    floors = declared.floor_tran**2 * o.duration, declared.floor_rot**2 * o.duration
+    best, error = maximum_likelihood(
+        lambda p: motion_residuals(p, o, before, after, floors),
+        [1, 1, 0, 0.02**2, 0.02**2, 0.02**2, 0],
+        [3, 4, 5],
+    )
+    return best.tolist(), error.tolist(), len(o.dx)
+
+
+def _intervals(log, interval):
+    """`Odometry` of intervals between true poses [n], and the poses [n, 3] at their two ends."""
+    moving = log.odometry_time
+    # A command is executed at its stamp: in between there is no saying how far it got.
+    stamps = log.truth.time if log.odometry_kind == "velocity" else moving
+    pose = truth_at(log.truth, stamps, GAP)
+    usable = np.isfinite(pose).all(1) & (stamps >= moving[0]) & (stamps <= moving[-1])
+    stamps, pose, ends, end = stamps[usable], pose[usable], [], 0
+    while end < len(stamps):
+        ends.append(end)
+        end = max(end + 1, np.searchsorted(stamps, stamps[end] + int(interval * 1e9)))
+    require(log, len(ends) > LEAST, f"over {LEAST} s of odometry and true poses together")
+    stamps, pose = stamps[ends], pose[ends]
+    bare = dict.fromkeys(("range", "point", "point_cov", "identity", "descriptor", "truth"))
+    bare |= {"frame": np.empty(0, int), "bearing": np.empty(0)}
+    odometry = increments(replace(log, frame_time=stamps, **bare))
+    length = np.diff(stamps)
+    kept = length <= 2 * max(interval * 1e9, np.median(length))  # not across a hole in the truth
+    return type(odometry)(*(leaf[1:][kept] for leaf in odometry)), pose[:-1][kept], pose[1:][kept]
+
+
+def motion_residuals(p, o, before, after, floors):
+    """Errors [n, 3] along, across and in heading, and covariances [n, 3, 3], as `motion.model`.
+
+    `p`: gains (translation, rotation), drift's bias, squares of err_tran, err_rot and err_drift,
+    and the drive's yaw.
+    """
+    gain_tran, gain_rot, bias, tran, rot, drift, yaw = p
+    length = gain_tran * np.hypot(o.dx, o.dy)
+    bend = o.lever * (gain_rot - 1) * o.dtheta + bias * o.distance / 2
+    chord = before[:, 2] + yaw + np.arctan2(o.dy, o.dx) + bend
+    dx, dy = (after - before)[:, :2].T
+    c, s = np.cos(chord), np.sin(chord)
+    turned = wrap(after[:, 2] - before[:, 2] - gain_rot * o.dtheta - bias * o.distance)
+    drifted, spun = drift * o.distance + floors[1], rot * o.turn
+    cov = np.zeros((len(dx), 3, 3))
+    cov[:, 0, 0] = tran * o.distance + floors[0]
+    cov[:, 1, 1] = length**2 * (drifted / 3 + (o.lever**2 + o.lever_var) * spun) + floors[0]
+    cov[:, 1, 2] = cov[:, 2, 1] = length * (drifted / 2 + o.lever * spun)
+    cov[:, 2, 2] = drifted + spun
+    return np.column_stack([c * dx + s * dy - length, c * dy - s * dx, turned]), cov

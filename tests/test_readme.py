@@ -1,0 +1,51 @@
+"""What the README says runs."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from jaxslam import cli
+
+README = Path(__file__).resolve().parents[1] / "README.md"
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+
+
+def test_the_python_on_one_screen_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (code,) = blocks("python")
+    exec(compile(code, "README.md", "exec"), {})
+    assert float(capsys.readouterr().out.split()[-1]) < 1.0
+    assert (tmp_path / "runs/python/map.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_the_commands_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    lines = [line for block in blocks("sh") for line in block.splitlines()]
+    commands = [
+        shlex.split(line, comments=True)[1:] for line in lines if line.startswith("jaxslam ")
+    ]
+    assert len(commands) >= 7
+    for command in commands:
+        assert cli.main(command) == 0, command
+    assert capsys.readouterr().err == ""
+
+
+def test_every_command_in_the_readme_exists_and_every_command_is_in_it(capsys):
+    text = README.read_text(encoding="utf-8")
+    named = set(re.findall(r"jaxslam ([a-z]+)\b", text)) - {"import"}
+    known = {"demo", "run", "compare", "convert", "check", "evaluate", "plot", "simulate"}
+    assert known <= named
+    for name in named:
+        assert cli.main([name, "--help"]) in (0, None)
+    assert "Example" in capsys.readouterr().out
+
+
+def test_the_pictures_and_pages_are_there():
+    for target in re.findall(r"\]\(([^)]+)\)", README.read_text(encoding="utf-8")):
+        assert (README.parent / target).exists(), target
