@@ -106,7 +106,7 @@ def _fit_sensor(log):
     counts = {"measurements": len(r) + clutter, "outliers": int(far.sum()) + clutter}
     share = counts["outliers"] / counts["measurements"]
     values = dict(zip(("mount_yaw", "sigma_bearing", "growth"), best, strict=True), outlier=share)
-    values["mount_yaw"] += log.mounting[2]
+    values["mount_yaw"] = log.mounting[2] - best[0]  # a sensor turned to the left reads too little
     errors = dict(zip(("mount_yaw", "sigma_bearing", "growth"), error, strict=True))
     errors["outlier"] = np.sqrt(share * (1 - share) / counts["measurements"])
     if log.range is not None:

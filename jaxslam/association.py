@@ -7,6 +7,7 @@ takes the slot of greatest density, if that beats the alternatives ("new" and "c
 import jax
 import jax.numpy as jnp
 
+from jaxslam.geometry import wrap
 from jaxslam.landmarks import score
 
 NEW, CLUTTER, PADDING = -1, -2, -3
@@ -46,7 +47,7 @@ def _known(config, scorer, measurements, clutter, params):
 def _maximum_likelihood(config, scorer, measurements, threshold, params):
     """Best slot of each measurement, or -1; exclusive: the best pair first, over the frame."""
     value, cov = _columns(measurements)
-    slots, lanes = scorer.constant.shape
+    lanes = scorer.constant.shape[1]
     start = (
         jnp.broadcast_to(threshold[:, None], (len(threshold), lanes)).astype(scorer.constant.dtype),
         jnp.full((len(threshold), lanes), -1, jnp.int32),
@@ -59,12 +60,43 @@ def _maximum_likelihood(config, scorer, measurements, threshold, params):
         better = density > best[0]
         return jnp.where(better, density, best[0]), jnp.where(better, m, best[1])
 
-    # Slots are filled from the lowest: beyond the highest one in use there is nothing to look at.
-    used = jnp.max(jnp.where(scorer.constant > -jnp.inf, jnp.arange(slots)[:, None] + 1, 0))
-    best = jax.lax.fori_loop(0, used, look, start)
+    rows, count = _candidates(config, scorer, measurements, threshold)
+    best = jax.lax.fori_loop(0, count, lambda i, best: look(rows[i], best), start)
     if not config.exclusive:
         return best[1]
     return _settle(config, scorer, measurements, threshold, params, best)
+
+
+def _candidates(config, scorer, measurements, threshold):
+    """Slots [M] that some particle of the block might match, first, and how many they are.
+
+    A density is at most its normaliser's, less half the square of one component's innovation over
+    that component's variance; here with the innovations' smallest and the variances' largest value
+    over the block, so that nothing is missed (a NaN counts as possible).
+    """
+    slots = scorer.constant.shape[0]
+    upper = jnp.broadcast_to(scorer.constant.max(-1), (len(threshold), slots))
+    if config.sensor == "bearing":
+        parts = [(0, scorer.matrix[0], True)]
+    elif config.sensor == "range_bearing":
+        a, b, c = scorer.matrix
+        parts = [(0, a - b * b / (4 * c), False), (1, c - b * b / (4 * a), True)]
+    else:  # the variance differs from measurement to measurement
+        parts = []
+    away = jnp.zeros_like(upper)
+    for i, factor, angle in parts:
+        z, predicted = measurements.value[:, i, None], scorer.value[i]
+        reference = predicted[:, :1] if angle else 0.0
+        off = wrap(predicted - reference) if angle else predicted
+        low, high = off.min(-1), off.max(-1)
+        at = wrap(z - reference[:, 0]) if angle else z
+        turns = (-2 * jnp.pi, 0.0, 2 * jnp.pi) if angle else (0.0,)
+        gaps = [jnp.maximum(low - (at + t), (at + t) - high) for t in turns]
+        gap = jnp.maximum(jnp.stack(gaps).min(0), 0)
+        # a shade less, for rounding
+        away = jnp.maximum(away, gap**2 * (1e-6 * scorer.matrix[2 * i] - 0.999 * factor).min(-1))
+    possible = (~(upper - jnp.maximum(away, 0) <= threshold[:, None])).any(0)
+    return jnp.nonzero(possible, size=slots, fill_value=0)[0].astype(jnp.int32), possible.sum()
 
 
 def _settle(config, scorer, measurements, threshold, params, best):
@@ -80,11 +112,13 @@ def _settle(config, scorer, measurements, threshold, params, best):
 
     def losers(best):
         density, slot = best
-        same = (slot[:, None] == slot[None]) & (slot[:, None] >= 0)
-        stronger = (density[None] > density[:, None]) | (
-            (density[None] == density[:, None]) & (index[None] < index[:, None])
-        )
-        return (same & stronger).any(1)
+
+        def beaten(j, lost):
+            stronger = (density[j] > density) | ((density[j] == density) & (j < index))
+            return lost | ((slot == slot[j]) & stronger)
+
+        lost = jax.lax.fori_loop(0, len(slot), beaten, jnp.zeros(slot.shape, bool))
+        return lost & (slot >= 0)
 
     def move(carry):
         (density, slot), lost = carry

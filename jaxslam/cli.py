@@ -19,7 +19,6 @@ HELP = f"""FastSLAM: from a logged run to map, trajectory and figures.
 
 Begin with:  jaxslam demo     (a real robot's run becomes a map, in runs/demo)
 Then:        jaxslam run {DEMO} --sensor bearing
-
 LOG is a .npz file, or {DEMO}, a log that comes with the program.
 Each command has a --help of its own, with an example.
 Exit codes: 0 ok, 1 ended with warnings, 2 bad input or usage, 130 interrupted."""
@@ -326,7 +325,8 @@ def _bar(what):
 
         def show(done, total):
             text = what if done else f"{what}: compiling… (once)"
-            bar.update(task, description=text, completed=done, total=total if done else None)
+            length = total if done else None  # None: it swings to and fro
+            bar.update(task, description=text, completed=done, total=length, refresh=True)
 
         yield show
 

@@ -66,7 +66,16 @@ class Config:
 
         Nothing is exclusive, nothing is clutter and nothing is forgotten (paper, section III-D).
         """
-        rules = dict(sensor="position", exclusive=False, clutter=False, forgetting=False)
+        # All of them, so that no later default changes the preset.
+        rules = dict(
+            sensor="position",
+            association="maximum_likelihood",
+            proposal="prior",
+            resample_threshold=0.5,
+            exclusive=False,
+            clutter=False,
+            forgetting=False,
+        )
         return cls(
             particles=particles,
             landmarks=landmarks,
@@ -168,8 +177,8 @@ _DEFAULTS = Params(
     view_min=-math.pi,
     view_max=math.pi,
     view_range=10.0,
-    inv_depth_mean=0.5,
-    inv_depth_sd=0.5,
+    inv_depth_mean=0.4,
+    inv_depth_sd=0.25,
     existence_new=1.0,
     existence_seen=0.5,
     existence_miss=0.1,
@@ -178,7 +187,9 @@ _DEFAULTS = Params(
 )
 
 # Bearings alone drag a wrong depth along: they need to be believed less.
-_OF_SENSOR = {"bearing": dict(sigma_bearing=0.08, growth=0.1, outlier=1e-3)}
+_OF_SENSOR = {
+    "bearing": dict(err_tran=0.04, sigma_bearing=0.1, growth=0.02, outlier=1e-3),
+}
 
 
 def default_params(sensor="range_bearing", log=None):

@@ -3,9 +3,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.association import CLUTTER, NEW, PADDING, associate
+from jaxslam.association import CLUTTER, NEW, PADDING, _candidates, associate
 from jaxslam.config import Config, default_params
-from jaxslam.landmarks import Scorer
+from jaxslam.landmarks import Scorer, score
 from jaxslam.sensors import Measurements
 
 K, M, N = 5, 7, 300
@@ -104,3 +104,33 @@ def test_known_identities_are_slots():
     match = associate(config, scorer, measurements, jnp.full(5, -1.0), -2.0, default_params())
     # fits; clutter is likelier; slot empty; no such slot; padding
     np.testing.assert_array_equal(match[:, 0], [1, CLUTTER, NEW, NEW, PADDING])
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("scatter", [0.01, 0.3, 4.0])
+def test_slots_that_are_passed_over_could_not_have_matched(x64, seed, scatter):
+    """Range and bearing, strongly correlated, across the seam at pi, against a dense table."""
+    rng = np.random.default_rng(seed)
+    slots, lanes, k = 40, 64, 6
+    r = rng.uniform(1, 6, (slots, 1)) + scatter * rng.normal(size=(slots, lanes))
+    b = rng.uniform(-np.pi, np.pi, (slots, 1)) + scatter * rng.normal(size=(slots, lanes))
+    sd0, sd1 = rng.uniform(0.02, 0.1, (2, slots, lanes))
+    s01 = sd0 * sd1 * rng.uniform(-0.999, 0.999, (slots, lanes))
+    det = sd0**2 * sd1**2 - s01**2
+    scorer = Scorer(
+        value=(jnp.asarray(r), jnp.asarray((b + np.pi) % (2 * np.pi) - np.pi)),
+        matrix=tuple(map(jnp.asarray, (-0.5 * sd1**2 / det, s01 / det, -0.5 * sd0**2 / det))),
+        constant=jnp.where(rng.uniform(size=det.shape) < 0.9, -0.5 * np.log(det), -jnp.inf),
+    )
+    value = np.stack([rng.uniform(1, 6, k), rng.uniform(-np.pi, np.pi, k)], 1)
+    measurements = frame(np.zeros(k))._replace(value=jnp.asarray(value))
+    config = Config(measurements=k, landmarks=slots, particles=lanes, exclusive=False)
+    params, threshold = default_params(), jnp.full(k, -1.0)
+    match = associate(config, scorer, measurements, threshold, -9.0, params)
+    columns = tuple(jnp.asarray(value[:, i, None, None]) for i in range(2))
+    table = np.asarray(score("range_bearing", scorer, columns, None, params))
+    expected = np.where(table.max(1) > -1, table.argmax(1), NEW)
+    np.testing.assert_array_equal(match, expected)
+    _, count = _candidates(config, scorer, measurements, threshold)
+    assert (match >= 0).any()
+    assert count < slots or scatter > 0.01  # a tight block passes most over

@@ -2,6 +2,7 @@
 
 import functools
 from dataclasses import replace
+from itertools import pairwise
 
 import jax.numpy as jnp
 import numpy as np
@@ -90,7 +91,7 @@ def test_residuals_by_range_show_what_the_model_says():
     bins = model().by_range
     assert len(bins) == 12
     assert sum(b.count + b.outliers for b in bins) < model().counts["measurements"]
-    assert all(a.high == b.low for a, b in zip(bins, bins[1:], strict=False))
+    assert all(a.high == b.low for a, b in pairwise(bins))
     for b in bins:
         assert b.bearing_sd == pytest.approx(b.model_sd, rel=4 / np.sqrt(2 * b.count) + 0.02)
         assert b.range_sd == pytest.approx(0.04, rel=4 / np.sqrt(2 * b.count))
@@ -112,14 +113,10 @@ def test_measured_identities_serve_where_true_ones_are_missing():
 def test_bearings_alone_are_enough():
     found = fit(replace(drive(), range=None))
     assert "sigma_range" not in found.values
-    assert errors_without(found, "sigma_range") < 4
     assert np.isnan([b.range_sd for b in found.by_range]).all()
-
-
-def errors_without(found, name):
-    values = found.values | {name: NOISE[name]}
-    return max(map(abs, errors(replace(
-        found, values=values, standard_errors=found.standard_errors | {name: 1.0})).values()))  # fmt: skip
+    for name in ("sigma_bearing", "growth", "mount_yaw", "err_drift"):
+        near = 0.3 * found.standard_errors[name]  # outliers in range are no longer left out
+        assert found.values[name] == pytest.approx(model().values[name], abs=near), name
 
 
 def test_turning_the_robots_frame_changes_only_where_it_drives():
@@ -180,7 +177,7 @@ def test_bundled_log_has_the_errors_others_found():
     assert np.degrees(bins[0].bearing_sd) == pytest.approx(2.8, abs=0.3)
     assert np.degrees(bins[-1].bearing_sd) == pytest.approx(0.4, abs=0.1)
     assert v["outlier"] < 0.01
-    assert np.degrees(v["mount_yaw"]) == pytest.approx(0.1, abs=0.15)
+    assert np.degrees(v["mount_yaw"]) == pytest.approx(0, abs=0.2)
     assert v["gain_rot"] == pytest.approx(0.95, abs=0.04)
     assert v["gain_tran"] == pytest.approx(1.01, abs=0.02)
     # Its true headings point 4.6 degrees to the left of where it drives.

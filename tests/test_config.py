@@ -1,0 +1,165 @@
+"""Settings and numbers: what is allowed, what the defaults are, what a log declares."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from jaxslam.config import ASSOCIATIONS, SENSORS, UNITS, Config, Params, default_params
+from jaxslam.log import Log
+
+
+def make_log(**changes):
+    return Log(
+        name="a log",
+        odometry_time=[0],
+        odometry=[[0.0, 0.0]],
+        frame_time=[0],
+        frame=np.empty(0, int),
+        bearing=np.empty(0),
+        **({"view": (-1.0, 2.0, 7.0), "mounting": (0.1, -0.2, 0.3)} | changes),
+    )
+
+
+def settings(config):
+    """All but `block`, which decides the speed alone."""
+    values = dataclasses.asdict(config)
+    del values["block"]
+    return values
+
+
+def test_defaults():
+    assert settings(Config()) == {
+        "sensor": "range_bearing",
+        "association": "maximum_likelihood",
+        "particles": 1000,
+        "landmarks": 64,
+        "measurements": 16,
+        "resample_threshold": 0.5,
+        "exclusive": True,
+        "clutter": True,
+        "forgetting": True,
+        "proposal": "prior",
+    }
+
+
+def test_the_papers_preset_field_by_field():
+    # Written out: when defaults change, the preset must not.
+    assert settings(Config.paper()) == {
+        "sensor": "position",
+        "association": "maximum_likelihood",
+        "particles": 1000,
+        "landmarks": 64,
+        "measurements": 16,
+        "resample_threshold": 0.5,
+        "exclusive": False,
+        "clutter": False,
+        "forgetting": False,
+        "proposal": "prior",
+    }
+    assert Config.paper(particles=10, landmarks=3, measurements=2) == Config(
+        sensor="position",
+        particles=10,
+        landmarks=3,
+        measurements=2,
+        exclusive=False,
+        clutter=False,
+        forgetting=False,
+    )
+    assert Config.paper(association="known", clutter=True).clutter
+    with pytest.raises(ValueError, match=r"Config\.particles"):
+        Config.paper(particles=0)
+
+
+@pytest.mark.parametrize("name", ["particles", "landmarks", "measurements", "block"])
+@pytest.mark.parametrize("value", [0, -1, 2.0, 1.5, "8", None, True, math.nan])
+def test_sizes_are_whole_numbers_of_at_least_one(name, value):
+    with pytest.raises(ValueError, match=rf"^Config\.{name}: .* whole number of at least 1$"):
+        Config(**{name: value})
+    assert getattr(Config(**{name: 1}), name) == 1
+
+
+@pytest.mark.parametrize("value", [-0.1, math.inf, math.nan, "half", None])
+def test_the_threshold_is_a_number_of_at_least_zero(value):
+    with pytest.raises(ValueError, match=r"^Config\.resample_threshold: "):
+        Config(resample_threshold=value)
+
+
+@pytest.mark.parametrize("value", [0, 0.0, 0.5, 1, 2])
+def test_thresholds_of_never_sometimes_and_always_are_allowed(value):
+    assert Config(resample_threshold=value).resample_threshold == value
+
+
+@pytest.mark.parametrize(
+    "name, allowed",
+    [("sensor", SENSORS), ("association", ASSOCIATIONS), ("proposal", ("prior",))],
+)
+def test_names_are_checked_and_the_allowed_ones_listed(name, allowed):
+    for value in allowed:
+        assert getattr(Config(**{name: value}), name) == value
+    for value in ("camera", "", None, 3):
+        with pytest.raises(ValueError) as caught:
+            Config(**{name: value})
+        assert str(caught.value) == (f"Config.{name}: {value!r} is not one of {', '.join(allowed)}")
+
+
+@pytest.mark.parametrize("name", ["exclusive", "clutter", "forgetting"])
+@pytest.mark.parametrize("value", [1, 0, "yes", 0.5])
+def test_switches_are_true_or_false(name, value):
+    with pytest.raises(ValueError, match=rf"^Config\.{name}: .* true or false$"):
+        Config(**{name: value})
+
+
+def test_forgetting_is_off_with_known_identities_unless_asked_for():
+    assert Config().forgetting is True
+    assert Config(association="known").forgetting is False
+    assert Config(association="known", forgetting=True).forgetting is True
+    assert Config(forgetting=False).forgetting is False
+
+
+def test_equal_settings_are_one_key_for_the_compiler():
+    assert hash(Config()) == hash(Config(forgetting=True))
+    assert Config() == Config(forgetting=True) != Config(particles=7)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Config().particles = 3
+
+
+def test_every_parameter_has_a_unit_and_every_unit_a_parameter():
+    assert tuple(UNITS) == Params._fields
+    assert all(UNITS.values())
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_default_params_are_finite_numbers(sensor):
+    params = default_params(sensor)
+    assert all(isinstance(value, float) and math.isfinite(value) for value in params)
+
+
+def test_default_params_without_a_log_see_all_around():
+    params = default_params()
+    assert (params.view_min, params.view_max) == (-math.pi, math.pi)
+    assert (params.mount_x, params.mount_y, params.mount_yaw) == (0, 0, 0)
+    assert (params.gain_tran, params.gain_rot, params.bias_drift) == (1, 1, 0)
+
+
+def test_a_log_declares_mounting_view_and_noise_and_nothing_else():
+    log = make_log(noise={"sigma_bearing": 0.005, "err_rot": 0.2, "mount_x": 0.15})
+    params, plain = default_params("bearing", log), default_params("bearing")
+    declared = {
+        "mount_x": 0.15,  # what is declared by name comes last
+        "mount_y": -0.2,
+        "mount_yaw": 0.3,
+        "view_min": -1.0,
+        "view_max": 2.0,
+        "view_range": 7.0,
+        "sigma_bearing": 0.005,
+        "err_rot": 0.2,
+    }
+    for name in Params._fields:
+        assert getattr(params, name) == declared.get(name, getattr(plain, name)), name
+
+
+def test_default_params_of_no_sensor():
+    with pytest.raises(ValueError, match=r"^sensor: 'sonar' is not one of position, range"):
+        default_params("sonar")

@@ -1,0 +1,209 @@
+"""Whole runs: shapes, types, seeds, places, and that nothing lost stays unsaid."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaxslam.config import Config, default_params
+from jaxslam.runner import config_for, run
+from jaxslam.simulate import planar
+
+SIZES = dict(particles=30, landmarks=30)
+
+
+@pytest.fixture(scope="module")
+def log():
+    return planar("field", 5, landmarks=25, length_m=12.0, rate_hz=2.0, outlier=0.05)
+
+
+@pytest.fixture(scope="module")
+def config(log):
+    return config_for(log, **SIZES)
+
+
+@pytest.fixture(scope="module")
+def calls():
+    return []
+
+
+@pytest.fixture(scope="module")
+def result(log, config, calls):
+    return run(log, config, seed=3, progress=lambda *args: calls.append(args))
+
+
+def test_result_has_a_row_for_every_frame(log, config, result):
+    t, k = len(log.frame_time), config.measurements
+    rows = {
+        "time": ((), np.int64),
+        "pose": ((3,), np.float64),
+        "cov": ((3, 3), np.float32),
+        "ess": ((), np.float32),
+        "resampled": ((), np.bool_),
+        "new": ((), np.int32),
+        "overflow": ((), np.float64),
+        "outliers": ((), np.float64),
+        "forgotten": ((), np.float64),
+        "log_evidence": ((), np.float32),
+        "nonfinite": ((), np.int32),
+        "degenerate": ((), np.bool_),
+        "match": ((k,), np.int64),
+        "row": ((k,), np.int64),
+        "dead_reckoning": ((3,), np.float64),
+    }
+    for name, (shape, dtype) in rows.items():
+        value = getattr(result, name)
+        assert isinstance(value, np.ndarray), name
+        assert value.shape == (t, *shape), name
+        assert value.dtype == dtype, name
+    np.testing.assert_array_equal(result.time, log.frame_time)
+    assert result.log is log and result.config is config and result.seed == 3
+    assert result.params == default_params(config.sensor, log)
+
+
+def test_landmarks_are_a_table(result):
+    world = result.landmarks
+    count = len(world.id)
+    assert count > 5
+    shapes = {"id": (count,), "mean": (count, 2), "cov": (count, 3), "n": (count,)}
+    for name, shape in (shapes | {"identity": (count,)}).items():
+        assert getattr(world, name).shape == shape
+        assert getattr(world, name).dtype == (np.float64 if name in ("mean", "cov") else np.int64)
+    assert len(np.unique(world.id)) == count
+    assert (world.n >= 1).all()
+    np.testing.assert_array_equal(world.identity, -1)  # identities were hidden
+    assert (world.cov[:, 0] * world.cov[:, 2] > world.cov[:, 1] ** 2).all()
+
+
+def test_result_means_something(log, config, result):
+    true = log.truth.pose
+    off = np.hypot(*(result.pose - true)[:, :2].T)
+    assert off.max() < 0.5
+    assert (result.ess >= 1).all() and (result.ess <= config.particles * 1.0001).all()
+    assert result.resampled.any() and not result.resampled.all()
+    assert result.new.sum() >= len(result.landmarks.id)
+    assert result.log_likelihood == pytest.approx(np.sum(result.log_evidence), rel=1e-5)
+    assert not result.degenerate.any() and not result.nonfinite.any()
+    assert result.seconds > 0 and result.compile_seconds > 0
+    nearest = np.hypot(*(result.landmarks.mean[:, None] - log.truth.landmarks).T).min(0)
+    assert np.median(nearest) < 0.2
+
+
+def test_matches_tell_which_measurement_began_the_landmark(log, config, result):
+    # Every measurement in its slot, padding elsewhere.
+    np.testing.assert_array_equal(result.match == -3, result.row == -1)
+    np.testing.assert_array_equal(np.sort(result.row[result.row >= 0]), np.arange(len(log.frame)))
+    assert ((result.match >= -3) & (result.match < result.match.size)).all()
+    frame, _ = np.nonzero(result.match >= 0)
+    births = result.match[result.match >= 0]
+    assert (births < frame * config.measurements).all()  # from an earlier frame
+    # What is matched was measured there: a landmark's measurements are of one true landmark.
+    began = result.row[np.divmod(births, config.measurements)]
+    again = result.row[result.match >= 0]
+    identity = log.truth.identity
+    assert np.mean(identity[began] == identity[again]) > 0.95
+    assert set(result.landmarks.id) <= set(births) | set(np.flatnonzero(result.match == -1))
+
+
+def test_progress_is_told_from_the_start_to_the_end(log, result, calls):
+    total = len(log.frame_time)
+    assert calls[0] == (0, total) and calls[-1] == (total, total)
+    done = [d for d, _ in calls]
+    assert done == sorted(done) and {t for _, t in calls} == {total}
+
+
+def same(a, b):
+    for name in ("pose", "cov", "ess", "match", "log_evidence", "dead_reckoning"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+    for one, two in zip(a.landmarks, b.landmarks, strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+def test_one_seed_gives_the_same_bits_with_truth_or_without(log, config, result):
+    same(result, run(replace(log, truth=None), config, seed=3))
+
+
+def test_seeds_differ_and_agree_on_the_world(log, config, result):
+    other = run(log, config, seed=4)
+    assert not np.array_equal(other.pose, result.pose)
+    assert np.abs(other.pose - result.pose)[:, :2].max() < 0.5
+
+
+def test_far_from_the_origin_is_the_same(log, config, result):
+    shift = np.array([1e5, -1e5, 0.0])
+    far = run(replace(log, start_pose=log.start_pose + shift), config, seed=3)
+    np.testing.assert_allclose(far.pose - shift, result.pose, atol=1e-3)
+    np.testing.assert_allclose(far.dead_reckoning - shift, result.dead_reckoning, atol=1e-3)
+    np.testing.assert_allclose(far.landmarks.mean - shift[:2], result.landmarks.mean, atol=1e-3)
+    np.testing.assert_array_equal(far.match, result.match)
+
+
+def test_what_was_lost_is_flagged(config, result):
+    assert result.flags == []
+    crowded = planar("room", 6, landmarks=120, length_m=12.0, rate_hz=2.0)
+    full = run(replace(crowded, skipped={"not a number": 7}), config)
+    lost = np.maximum(np.bincount(crowded.frame) - config.measurements, 0).sum()
+    assert full.dropped == {"no measurement slot": lost}
+    assert lost > 0 and (full.row >= 0).sum() == len(crowded.frame) - lost
+    first = np.flatnonzero(full.overflow)[0]
+    overflow = float(full.overflow.sum())
+    assert full.flags == [
+        f"{lost} measurements left out: no measurement slot",
+        "7 rows skipped by the reader: not a number",
+        f"the map was full from frame {first} on: {overflow:.1f} landmarks lost per particle; "
+        "more than 30 landmark slots are needed",
+    ]
+
+
+def test_flags_of_what_went_wrong(log, result):
+    nothing, frames = np.zeros(len(log.frame_time)), np.arange(len(log.frame_time))
+    pose = np.array(result.pose)
+    pose[4] = np.nan
+    broken = replace(
+        result, pose=pose, nonfinite=nothing + (frames == 2) * 9, degenerate=frames < 2
+    )
+    assert broken.flags == [
+        "9 particle weights were not finite",
+        "all weights were zero in 2 frames",
+        "the pose estimate is not finite",
+    ]
+
+
+def test_known_identities_name_the_landmarks(log):
+    config = config_for(log, association="known", particles=30)
+    assert config.landmarks == len(np.unique(log.identity[log.identity >= 0]))
+    result = run(log, config)
+    clutter = int((log.identity < 0).sum())
+    assert result.dropped["no identity"] == clutter > 0
+    identity = result.landmarks.identity
+    assert len(np.unique(identity)) == len(identity) > 10
+    true = log.truth.landmarks[np.searchsorted(log.truth.landmark_id, identity)]
+    assert np.hypot(*(result.landmarks.mean - true).T).max() < 0.5
+
+
+def test_a_sensor_or_identities_that_the_log_lacks_are_named(log):
+    only = replace(log, range=None, identity=None)
+    said = []
+    with pytest.raises(ValueError, match="sensor 'range_bearing' is not in this log; it has bear"):
+        run(only, Config(**SIZES), progress=lambda *args: said.append(args))
+    with pytest.raises(ValueError, match="'known' needs identities; this log has none"):
+        run(only, Config(sensor="bearing", association="known", **SIZES))
+    assert not said
+
+
+def test_config_fits_the_log(log):
+    fullest = np.bincount(log.frame).max()
+    config = config_for(log)
+    assert (config.sensor, config.measurements) == ("range_bearing", fullest)
+    assert config.landmarks == Config().landmarks
+    assert config_for(log, measurements=5, landmarks=7) == Config(measurements=5, landmarks=7)
+    assert config_for(log, "position").sensor == "position"
+    assert config_for(replace(log, range=None)).sensor == "bearing"
+    points = np.column_stack([log.range, log.bearing])
+    cov = np.tile([1.0, 0.0, 1.0], (len(points), 1))
+    only_points = replace(log, range=None, bearing=None, point=points, point_cov=cov)
+    assert config_for(only_points).sensor == "position"
+    empty = replace(log, frame=np.empty(0, int), bearing=np.empty(0), range=np.empty(0),
+                    identity=np.empty(0, int), truth=None)  # fmt: skip
+    assert config_for(empty).measurements == 1
+    assert config_for(empty, association="known").landmarks == 1
