@@ -122,7 +122,7 @@ def test_slots_that_are_passed_over_could_not_have_matched(x64, seed, scatter):
         matrix=tuple(map(jnp.asarray, (-0.5 * sd1**2 / det, s01 / det, -0.5 * sd0**2 / det))),
         constant=jnp.where(rng.uniform(size=det.shape) < 0.9, -0.5 * np.log(det), -jnp.inf),
     )
-    value = np.stack([rng.uniform(1, 6, k), rng.uniform(-np.pi, np.pi, k)], 1)
+    value = np.stack([r[:k, 0], b[:k, 0]], 1) + 0.03 * rng.normal(size=(k, 2))
     measurements = frame(np.zeros(k))._replace(value=jnp.asarray(value))
     config = Config(measurements=k, landmarks=slots, particles=lanes, exclusive=False)
     params, threshold = default_params(), jnp.full(k, -1.0)

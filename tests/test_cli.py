@@ -331,12 +331,16 @@ def test_usage(log, refuse):
     assert "y.csv: no such file" in refuse("convert", "y.csv", "x.npz")
 
 
-def test_memory_that_is_not_there(log, refuse, monkeypatch):
+def test_too_little_memory_is_told_and_a_fault_of_ours_not_hidden(log, refuse, monkeypatch):
+    texts = ["RESOURCE_EXHAUSTED: Out of memory allocating 64 GB.\nmore lines", "a bug"]
+
     def run(*given):
-        raise RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 64 GB.\nmore lines")
+        raise RuntimeError(texts.pop(0))
 
     monkeypatch.setattr(runner, "run", run)
     assert "not enough memory; ask for fewer --particles" in refuse("run", log)
+    with pytest.raises(RuntimeError, match="a bug"):
+        cli.main(["run", log])
 
 
 @pytest.mark.parametrize("place", ["runner.run", "report.summarise"])
@@ -348,15 +352,6 @@ def test_interrupted_while_filtering_or_writing_leaves_nothing(log, call, monkey
     found = call("run", log, *MANY, "--out", "result")
     assert found == (130, "", "jaxslam: interrupted\n")
     assert os.listdir() == [log]
-
-
-def test_a_fault_of_ours_is_not_hidden(log, monkeypatch):
-    def run(*given):
-        raise RuntimeError("a bug")
-
-    monkeypatch.setattr(runner, "run", run)
-    with pytest.raises(RuntimeError, match="a bug"):
-        cli.main(["run", log])
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, "simulate planar"])
