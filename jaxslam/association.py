@@ -76,12 +76,14 @@ def _candidates(config, scorer, measurements, threshold):
     """
     slots = scorer.constant.shape[0]
     upper = jnp.broadcast_to(scorer.constant.max(-1), (len(threshold), slots))
+    if config.sensor == "position":  # its density has a part per measurement: only empty is sure
+        upper = jnp.where(upper > -jnp.inf, jnp.inf, upper)
     if config.sensor == "bearing":
         parts = [(0, scorer.matrix[0], True)]
     elif config.sensor == "range_bearing":
         a, b, c = scorer.matrix
         parts = [(0, a - b * b / (4 * c), False), (1, c - b * b / (4 * a), True)]
-    else:  # the variance differs from measurement to measurement
+    else:
         parts = []
     away = jnp.zeros_like(upper)
     for i, factor, angle in parts:

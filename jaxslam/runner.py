@@ -13,7 +13,7 @@ from jaxslam import filter as fastslam
 from jaxslam import landmarks as maps
 from jaxslam.config import Config, Params, default_params
 from jaxslam.frames import dead_reckoning, frames
-from jaxslam.log import Log
+from jaxslam.log import NOT_USED, Log
 from jaxslam.paramfile import validate
 
 CHUNK = 256  # frames per compiled scan: one compilation serves logs of every length
@@ -95,8 +95,11 @@ class Result:
     def flags(self):
         """One line for everything that was lost or went wrong; empty when nothing did."""
         lines = [f"{count} measurements left out: {why}" for why, count in self.dropped.items()]
-        lines += [f"{count} rows skipped by the reader: {why}" for why, count in
-                  self.log.skipped.items()]  # fmt: skip
+        lines += [
+            f"{count} rows skipped by the reader: {why}"
+            for why, count in self.log.skipped.items()
+            if not why.startswith(NOT_USED)
+        ]
         lost = float(np.sum(self.overflow))
         if lost > 0:
             frame = int(np.flatnonzero(self.overflow)[0])
