@@ -26,15 +26,15 @@ CHUNK = 64  # steps per compiled scan, so that one compilation serves all
 
 
 def simulate(seconds, closed_loop=False, seed=0):
-    """A log in which the evidence hangs on the motion noise: the sensor is the better of the two.
+    """A log in which the evidence hangs on the motion noise, which is large.
 
     A controller that answers to the noise (`closed_loop`) adds turns to and fro that cancel out in
     the mean of a thinned row, and with them the noise they bring.
     """
     return planar(
-        "grid", seed, length_m=0.5 * seconds, odometry_hz=67, rate_hz=1, landmarks=36,
-        closed_loop=closed_loop, err_tran=0.1, err_rot=0.1, err_drift=0.1, floor_tran=0.01,
-        floor_rot=0.01, sigma_range=0.1, sigma_bearing=0.03, max_per_frame=6,
+        "room", seed, length_m=0.5 * seconds, odometry_hz=67, rate_hz=1, landmarks=36,
+        closed_loop=closed_loop, err_tran=0.1, err_rot=0.3, err_drift=0.1, floor_tran=0.05,
+        floor_rot=0.05, sigma_range=0.2, sigma_bearing=0.06, max_per_frame=6,
     )  # fmt: skip
 
 
