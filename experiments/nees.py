@@ -34,7 +34,7 @@ from jaxslam.frames import frames
 from jaxslam.simulate import planar
 
 RESULTS = Path(__file__).parent / "results"
-SLOTS, MOST = 64, 12  # landmarks in the map, measurements in a frame
+SLOTS, MOST = 48, 8  # landmarks in the map, measurements in a frame
 AT = (10, 30, 100, 300, 500)
 
 

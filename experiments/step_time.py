@@ -69,9 +69,6 @@ def jax_contender(marks, config, donated):
     factor = np.array([[KNOWN_TO], [0], [KNOWN_TO]]) * np.ones(len(marks))
     key = jax.random.key(0)
     state = fastslam.init(config, key, landmarks_given=(marks.T, factor))
-    # A given landmark starts at log-odds 0 and would be forgotten when first not seen.
-    odds = jnp.full_like(state.landmarks.log_odds, PARAMS.existence_max)
-    state = state._replace(landmarks=state.landmarks._replace(log_odds=odds))
     odometry, params = jax.tree.map(jnp.asarray, (DRIVE, Params(*map(float, PARAMS))))
     step = fastslam.step
     if donated:

@@ -21,20 +21,28 @@ from jaxslam.frames import frames
 from jaxslam.simulate import planar
 
 RESULTS = Path(__file__).parent / "results"
-RATES = (67, 10, 5)  # Hz, of odometry rows and of steps
+RATE = 67  # Hz, of the odometry as it comes
+ARMS = ((RATE, None), (10, None), (5, None), (RATE, 67), (RATE, 10), (RATE, 5))  # odometry, steps
+NOISE = (  # one kind at a time, large, as a small one could hide behind another
+    dict(err_tran=0.2),
+    dict(err_drift=0.15),
+    dict(err_rot=0.2),
+    dict(floor_tran=0.1, floor_rot=0.1),
+)
 CHUNK = 64  # steps per compiled scan, so that one compilation serves all
 
 
-def simulate(seconds, closed_loop=False, seed=0):
-    """A log in which the evidence hangs on the motion noise, which is large.
+def simulate(seconds, closed_loop=False, seed=0, **noise):
+    """A log of little motion noise but what is given, in which the evidence hangs on that.
 
     A controller that answers to the noise (`closed_loop`) adds turns to and fro that cancel out in
     the mean of a thinned row, and with them the noise they bring.
     """
+    quiet = dict(err_tran=0.02, err_rot=0.02, err_drift=0.02, floor_tran=0.002, floor_rot=0.002)
     return planar(
-        "room", seed, length_m=0.5 * seconds, odometry_hz=67, rate_hz=1, landmarks=36,
-        closed_loop=closed_loop, err_tran=0.1, err_rot=0.3, err_drift=0.1, floor_tran=0.05,
-        floor_rot=0.05, sigma_range=0.2, sigma_bearing=0.06, max_per_frame=6,
+        "room", seed, length_m=0.5 * seconds, odometry_hz=RATE, rate_hz=1, landmarks=36,
+        closed_loop=closed_loop, sigma_range=0.2, sigma_bearing=0.07, max_per_frame=6,
+        **quiet | noise,
     )  # fmt: skip
 
 
@@ -67,9 +75,9 @@ def steps(log, rate, config, params):
 
 
 def evidences(log, odometry_rate, step_rate, config, seeds):
-    """Log evidence of the log for every seed; rates None: as it is, and frames alone."""
+    """Log evidence of the log for every seed, its odometry thinned and steps added (`steps`)."""
     params = default_params(config.sensor, log)
-    thinned = thin(log, odometry_rate) if odometry_rate else log
+    thinned = log if odometry_rate == RATE else thin(log, odometry_rate)
     data = steps(thinned, step_rate, config, params)
     numbers = jax.tree.map(jnp.asarray, Params(*map(float, params)))
     total = -(-len(data[0].dx) // CHUNK) * CHUNK
@@ -100,46 +108,46 @@ def z_score(a, b):
     return (a.mean() - b.mean()) / np.sqrt(a.var(ddof=1) / len(a) + b.var(ddof=1) / len(b))
 
 
-def arms():
-    """(odometry Hz, step Hz); the first is the reference."""
-    return [(None, None), *[(r, None) for r in RATES[1:]], *[(None, r) for r in RATES], (5, 10)]
-
-
-def compare(log, config, seeds):
+def compare(log, config, seeds, arms=ARMS):
+    """A row per arm: mean and SD of the log evidence, and the z-score to the first arm's mean."""
     rows = []
-    for i, (odometry, step) in enumerate(arms()):
-        # Fresh seeds for every arm: the same ones would share their draws.
-        values = evidences(log, odometry, step, config, np.arange(seeds) + 1000 * i)
-        rows.append(dict(odometry_hz=odometry or RATES[0], step_hz=step, values=values.tolist()))
-        rows[-1] |= dict(mean=values.mean(), sd=values.std(ddof=1))
-        rows[-1] |= dict(z=z_score(values, np.array(rows[0]["values"])) if i else 0.0)
+    for i, (odometry, step) in enumerate(arms):
+        # Other seeds for every arm: they would share their draws.
+        values = evidences(log, odometry, step, config, np.arange(seeds) + seeds * i)
+        first = np.array(rows[0]["values"]) if rows else values
+        rows.append(
+            dict(odometry_hz=odometry, step_hz=step, mean=values.mean(), sd=values.std(ddof=1),
+                 z=z_score(values, first), values=values.tolist())
+        )  # fmt: skip
     return rows
 
 
 def main():
-    seconds, seeds, lines, content = 40, 20, [], []
-    lines = [f"Log evidence, {seconds} s, a frame a second, {seeds} seeds each.", ""]
-    lines += ["| identities | driven | odometry Hz | steps Hz | mean | SD | z to the first |"]
-    lines += ["|---|---|--:|--:|--:|--:|--:|"]
-    for association, closed_loop in (
-        ("known", False),
-        ("maximum_likelihood", False),
-        ("known", True),
-    ):
+    seconds, seeds, content = 30, 20, []
+    cases = [("known", False, noise) for noise in NOISE]
+    cases += [("maximum_likelihood", False, NOISE[1]), ("known", True, NOISE[1])]
+    names = [f"{o} Hz, steps {f'{s} Hz' if s else 'at frames'}" for o, s in ARMS]
+    lines = [
+        f"Log evidence of {seconds} s, a frame a second: mean, SD over {seeds} seeds (z to first).",
+        "",
+        "| identities | driven | noise | "
+        + " | ".join(f"odometry {name}" for name in names)
+        + " |",
+        "|---|---|---|" + "--:|" * len(names),
+    ]
+    print(*lines, sep="\n")
+    for association, closed_loop, noise in cases:
         config = Config(association=association, particles=2000, landmarks=48, measurements=6)
-        rows = compare(simulate(seconds, closed_loop), config, seeds)
-        names = association.replace("maximum_likelihood", "hidden"), closed_loop
-        content.append(dict(identities=names[0], closed_loop=closed_loop, rows=rows))
-        for row in rows:
-            lines.append(
-                "| {} | {} | {odometry_hz} | {} | {mean:.2f} | {sd:.2f} | {z:+.1f} |".format(
-                    names[0],
-                    "by truth" if closed_loop else "blindly",
-                    row["step_hz"] or "frames",
-                    **row,
-                )
-            )
-            print(lines[-1], flush=True)
+        rows = compare(simulate(seconds, closed_loop, **noise), config, seeds)
+        names = (
+            "known" if association == "known" else "hidden",
+            "steered by truth" if closed_loop else "blindly",
+            ", ".join(f"{name} {value}" for name, value in noise.items()),
+        )
+        cells = ["{mean:.2f}, {sd:.2f} ({z:+.1f})".format(**row) for row in rows]
+        lines.append(f"| {' | '.join([*names, *cells])} |")
+        print(lines[-1], flush=True)
+        content.append(dict(zip(("identities", "driven", "noise"), names, strict=True), rows=rows))
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / "thinning.md").write_text("\n".join(lines) + "\n")
     (RESULTS / "thinning.json").write_text(json.dumps(content, indent=1) + "\n")

@@ -24,7 +24,7 @@ _ARCTAN = (
 
 def wrap(angle):
     """Angle in [-pi, pi), rad."""
-    return angle - 2 * jnp.pi * jnp.floor((angle + jnp.pi) / (2 * jnp.pi))
+    return angle - 2 * jnp.pi * jnp.floor(angle * (0.5 / jnp.pi) + 0.5)
 
 
 def norm(x, y, smallest=1e-6):
@@ -100,12 +100,12 @@ def scalar_update(mean, factor, h, innovation, variance):
     f1, f2 = transpose_times(factor, h)
     s2 = variance + f2 * f2
     s1 = s2 + f1 * f1
-    root1, root2 = jnp.sqrt(s1), jnp.sqrt(s2)
-    gain = innovation / s1
+    inverse1, inverse2 = 1 / jnp.sqrt(s1), 1 / jnp.sqrt(s2)
+    gain = innovation * inverse1 * inverse1
     updated_mean = mean[0] + gain * f1 * l11, mean[1] + gain * (f1 * l21 + f2 * l22)
     updated_factor = (
-        l11 * root2 / root1,
-        (l21 * variance - l11 * l22 * l22 * h1 * h2) / (root1 * root2),
-        l22 * jnp.sqrt(variance) / root2,
+        l11 * s2 * inverse2 * inverse1,
+        (l21 * variance - l11 * l22 * l22 * h1 * h2) * inverse1 * inverse2,
+        l22 * jnp.sqrt(variance) * inverse2,
     )
     return updated_mean, updated_factor, s1

@@ -70,7 +70,9 @@ def scorer(sensor, seen, landmarks, inlier):
     s00, s11 = s00 + seen.noise[0], s11 + seen.noise[1]
     det = jnp.where(occupied, s00 * s11 - s01 * s01, 1.0)
     constant = jnp.where(occupied, inlier - sensors.LOG_2PI - 0.5 * jnp.log(det), -jnp.inf)
-    return Scorer(seen.value, (-0.5 * s11 / det, s01 / det, -0.5 * s00 / det), constant)
+    inverse = 1 / det
+    matrix = (-0.5 * s11 * inverse, s01 * inverse, -0.5 * s00 * inverse)
+    return Scorer(seen.value, matrix, constant)
 
 
 def score(sensor, scorer, value, cov, params):
@@ -152,7 +154,10 @@ def settle(world):
 
 
 def fill(world, given):
-    """The map with its first slots set to a given one: mean [2, L], factor [3, L] (, anchor)."""
+    """The map with its first slots set to a given one: mean [2, L], factor [3, L] (, anchor).
+
+    A given landmark is certain to exist until it has been seen.
+    """
     parts = dict(zip(("mean", "factor", "anchor"), given, strict=False))
     size = jnp.shape(parts["mean"])[1]
     if size > world.count.shape[0]:
@@ -160,6 +165,7 @@ def fill(world, given):
     world = world._replace(
         count=world.count.at[:size].set(1),
         birth=world.birth.at[:size].set(-jnp.arange(4, 4 + size, dtype=jnp.int32)[:, None]),
+        log_odds=None if world.log_odds is None else world.log_odds.at[:size].set(jnp.inf),
         **{
             name: getattr(world, name).at[:, :size].set(jnp.asarray(value)[:, :, None])
             for name, value in parts.items()

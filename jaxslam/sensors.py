@@ -67,7 +67,8 @@ def observe(sensor, sensor_pose, mean, anchor, params):
         dx, dy = depth * ax + c, depth * ay + s
         q = norm(dx, dy)
         bearing = wrap(direction(dy, dx) - heading)
-        row = ((dy * s + dx * c) / q**2, (dx * ay - dy * ax) / q**2)
+        scale = 1 / (q * q)
+        row = ((dy * s + dx * c) * scale, (dx * ay - dy * ax) * scale)
         r = q / jnp.maximum(depth, LEAST_INVERSE_DEPTH)
         variance = params.sigma_bearing**2 + (params.growth * depth / q) ** 2
         return Seen((bearing,), (row,), (variance,), r, bearing)
@@ -77,7 +78,9 @@ def observe(sensor, sensor_pose, mean, anchor, params):
     if sensor == "position":
         c, s = jnp.cos(heading), jnp.sin(heading)
         return Seen((c * dx + s * dy, c * dy - s * dx), ((c, s), (-s, c)), (), r, bearing)
-    rows = ((dx / r, dy / r), (-dy / r**2, dx / r**2))
+    inverse = 1 / r  # one division: XLA repeats this for everything that is worked out from it
+    c, s = dx * inverse, dy * inverse
+    rows = ((c, s), (-s * inverse, c * inverse))
     noise = (params.sigma_range**2, bearing_variance(r, params))
     return Seen((r, bearing), rows, noise, r, bearing)
 
