@@ -1,4 +1,4 @@
-"""Is the filter's uncertainty honest? `python experiments/nees.py` (about 6 minutes).
+"""Is the filter's uncertainty honest? `python experiments/nees.py` (about 15 minutes).
 
 Pose NEES (3 degrees of freedom, the filter's own covariance) over 100 simulated worlds per case.
 The start is known, nothing is aligned, and the filter has the simulation's parameters; driven
