@@ -18,7 +18,7 @@ DEMO = "lost-in-the-woods"
 HELP = f"""FastSLAM: from a logged run to map, trajectory and figures.
 
 Begin with:  jaxslam demo     (a real robot's run becomes a map, in runs/demo)
-Then:        jaxslam run {DEMO} --sensor bearing
+Then:        jaxslam run {DEMO} --sensor bearing --association known
 LOG is a .npz file, or {DEMO}, a log that comes with the program.
 Each command has a --help of its own, with an example.
 Exit codes: 0 ok, 1 ended with warnings, 2 bad input or usage, 130 interrupted."""
@@ -88,7 +88,7 @@ def run(
     The folder holds map.png, error.png, particles.png, trajectory.tum,
     landmarks.csv, summary.json, run.toml (every setting), events.jsonl, steps.npz.
 
-    Example: jaxslam run lost-in-the-woods --sensor bearing --out runs/woods
+    Example: jaxslam run lost-in-the-woods --particles 2000 --out runs/woods
     """
     with _bar("reading"):
         from jaxslam import report, runner
