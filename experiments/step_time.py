@@ -1,10 +1,10 @@
-"""Time of one filter step beside NumPy's: `python experiments/step_time.py` (about 3 minutes).
+"""Time of one filter step beside NumPy's: `python experiments/step_time.py` (about 1 minute).
 
 `range_bearing`, identities unknown, resampling every step, default `Config`, a given map, one core.
 Contenders take turns in one process: the public `jaxslam.filter.step`, plainly called and with its
 state donated; a vectorised NumPy filter in float32, on all particles at once and in blocks that fit
 the cache; and the loop baseline, on a few particles.
-Writes experiments/results/step_time.json and .md. `--quick`: a small trial, which writes nothing.
+At the default sizes it writes experiments/results/step_time.json and .md. `--quick`: a small trial.
 """
 
 import argparse
@@ -35,15 +35,10 @@ KNOWN_TO = 0.05  # m, standard deviation of the given map
 PARAMS = default_params("range_bearing")._replace(
     sigma_range=0.1, sigma_bearing=float(np.deg2rad(1)), growth=0.0, view_range=12.0
 )
+SIZES = dict(particles=10000, landmarks=100, measurements=20)
 LOOP_PARTICLES = 4
 BLOCK = 500  # particles at once in the blocked NumPy filter: the fastest of 16 to 10,000
-JAX, PLAIN, NUMPY, BLOCKED, LOOP = (
-    "jaxslam, state donated",
-    "jaxslam, plain call",
-    "vectorised NumPy",
-    "the same, in blocks",
-    "loop baseline",
-)
+LOOP = "loop baseline"
 
 
 def simulate(landmarks, measurements, steps, seed=0):
@@ -94,8 +89,7 @@ def numpy_contender(marks, config, block):
 
     def advance(z):
         nonlocal state
-        z = z.astype("f")
-        state, mean = vectorised_numpy.step(state, DRIVE, z, PARAMS, rng, block)
+        state, mean = vectorised_numpy.step(state, DRIVE, z.astype("f"), PARAMS, rng, block)
         return mean
 
     return advance, lambda: float((state[2] > 0).sum(1).mean())
@@ -108,18 +102,13 @@ def loop_contender(marks, config):
     def known(i, mark):
         return baseline_ekf.Landmark(mark, cov, np.zeros(2), 1, PARAMS.existence_max, -4 - i)
 
-    particles = [
-        baseline.Particle(np.zeros(3), [known(i, m) for i, m in enumerate(marks)], -np.log(n))
-        for _ in range(n)
-    ]
+    maps = [[known(i, mark) for i, mark in enumerate(marks)] for _ in range(n)]
+    particles = [baseline.Particle(np.zeros(3), each, -np.log(n)) for each in maps]
     index = 0
 
     def advance(z):
         nonlocal particles, index
-        frame = [
-            SimpleNamespace(k=k, value=value, cov=np.zeros((2, 2)), identity=-1)
-            for k, value in enumerate(z)
-        ]
+        frame = [SimpleNamespace(k=k, value=value, identity=-1) for k, value in enumerate(z)]
         draws = rng.standard_normal((3, n)), rng.random()
         particles, row = baseline.step(particles, DRIVE, frame, len(z), index, *draws, model)
         index += 1
@@ -132,17 +121,13 @@ def measure(given):
     """One row per contender: times, and how far its last mean pose is off the truth."""
     frames = 1 + given.rounds * given.steps
     marks, truth, seen = simulate(given.landmarks, given.measurements, frames)
-    config = Config(
-        particles=given.particles,
-        landmarks=given.landmarks,
-        measurements=given.measurements,
-        resample_threshold=1.0,
-    )
+    sizes = {name: getattr(given, name) for name in SIZES}
+    config = Config(**sizes, resample_threshold=1.0)
     contenders = {
-        JAX: jax_contender(marks, config, True),
-        PLAIN: jax_contender(marks, config, False),
-        NUMPY: numpy_contender(marks, config, given.particles),
-        BLOCKED: numpy_contender(marks, config, min(BLOCK, given.particles)),
+        "jaxslam, state donated": jax_contender(marks, config, True),
+        "jaxslam, plain call": jax_contender(marks, config, False),
+        "vectorised NumPy": numpy_contender(marks, config, given.particles),
+        "the same, in blocks": numpy_contender(marks, config, BLOCK),
         LOOP: loop_contender(marks, config),
     }
     poses = {name: advance(seen[0]) for name, (advance, _) in contenders.items()}  # compiles
@@ -150,10 +135,10 @@ def measure(given):
     for round_ in range(given.rounds):
         for name, (advance, _) in contenders.items():
             for t in range(1 + round_ * given.steps, 1 + (round_ + 1) * given.steps):
-                begin = time.perf_counter(), time.process_time()
+                begin, begin_cpu = time.perf_counter(), time.process_time()
                 poses[name] = advance(seen[t])
-                end = time.perf_counter(), time.process_time()
-                times[name].append(np.subtract(end, begin))
+                now = time.perf_counter(), time.process_time()
+                times[name].append((now[0] - begin, now[1] - begin_cpu))
     rows = []
     for name, (_, occupied) in contenders.items():
         wall, cpu = 1e3 * np.array(times[name]).T
@@ -178,10 +163,9 @@ def report(rows, machine, given):
         " | time / jaxslam's | pose off by | landmarks |",
         "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
-    first = rows[0]
     for row in rows:
-        share = row["particles"] / first["particles"]
-        ratio, least = (row[k] / share / first[k] for k in ("median_ms", "min_ms"))
+        share = row["particles"] / rows[0]["particles"]
+        ratio, least = (row[k] / share / rows[0][k] for k in ("median_ms", "min_ms"))
         lines.append(
             "| {name} | {particles} | {steps} | {min_ms:.1f} | {median_ms:.1f} |"
             " {cpu_median_ms:.1f} | {ns:.0f} |".format(**row)
@@ -191,26 +175,21 @@ def report(rows, machine, given):
     return "\n".join(lines) + "\n"
 
 
-def processor():
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    return next((x.split(":")[1].strip() for x in lines if x.startswith("model name")), "unknown")
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    for name, default in dict(particles=10000, landmarks=100, measurements=20).items():
+    for name, default in SIZES.items():
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--rounds", type=int, default=8)
     parser.add_argument("--steps", type=int, default=3, help="of each contender in a round")
-    parser.add_argument("--quick", action="store_true", help="500 particles, 2 rounds; no files")
+    parser.add_argument("--quick", action="store_true", help="500 particles, 2 rounds")
     given = parser.parse_args()
     if given.quick:
         given.particles, given.rounds = 500, 2
     rows = measure(given)
-    machine = f"one core of {processor()}, jax {jax.__version__}, numpy {np.__version__}"
-    text = report(rows, machine, given)
-    print(text)
-    if not given.quick:
+    cpu = Path("/proc/cpuinfo").read_text().split("model name\t: ")[-1].splitlines()[0]
+    machine = f"one core of {cpu}, jax {jax.__version__}, numpy {np.__version__}"
+    print(text := report(rows, machine, given))
+    if all(getattr(given, name) == size for name, size in SIZES.items()):
         RESULTS.mkdir(exist_ok=True)
         (RESULTS / "step_time.md").write_text(text)
         content = json.dumps(dict(machine=machine, given=vars(given), rows=rows), indent=1)
