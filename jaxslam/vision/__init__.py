@@ -1,0 +1,1 @@
+"""From images to bearings and points: camera, panorama, lines, matching, triangulation."""
