@@ -7,14 +7,13 @@ is imported where it is needed, so that `--help` comes at once.
 
 import os
 import sys
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 from cyclopts import App, CycloptsError, Parameter
-from cyclopts.validators import Number
 
-DEMO = "lost-in-the-woods"
+from jaxslam.console import DEMO, LogName, Overwrite, Seed, bar, check_new, option, warn, whole
+
 HELP = f"""FastSLAM: from a logged run to map, trajectory and figures.
 
 Begin with:  jaxslam demo     (a real robot's run becomes a map, in runs/demo)
@@ -34,27 +33,15 @@ simulate = App(name="simulate", help="Make a log of a simulated world, with its 
 app.command(simulate)
 
 
-def _option(kind, text):
-    # A flag's default says nothing.
-    return Annotated[kind, Parameter(help=text, show_default=False if kind is bool else None)]
-
-
-def _whole(text, least=1, most=10**9):
-    return Annotated[int, Parameter(help=text, validator=Number(gte=least, lte=most))]
-
-
-Seed = _whole("of the random draws: the same seed, the same run", 0, 2**32 - 1)
-LogName = _option(str, f"a .npz file, or {DEMO}")
-MovedLog = _option(str, "where the run's log is, if it was moved") | None
-Folder = _option(Path, "a run's folder")
-Overwrite = _option(bool, "replace what is there")
-ParamFile = _option(Path, "TOML file of parameters, for those it names") | None
-Paper = _option(bool, "the paper's rules: positions, each its best match, no clutter")
+MovedLog = option(str, "where the run's log is, if it was moved") | None
+Folder = option(Path, "a run's folder")
+ParamFile = option(Path, "TOML file of parameters, for those it names") | None
+Paper = option(bool, "the paper's rules: positions, each its best match, no clutter")
 Sensors = Literal["range_bearing", "position", "bearing"]
-Sensor = _option(Sensors, "what is used (the first that the log has)") | None
+Sensor = option(Sensors, "what is used (the first that the log has)") | None
 Worlds = Literal["room", "grid", "field"]
 Associations = Literal["maximum_likelihood", "known"]
-Association = _option(Associations, "find out which landmark was measured, or believe the log")
+Association = option(Associations, "find out which landmark was measured, or believe the log")
 
 
 @app.command
@@ -75,12 +62,12 @@ def run(
     *,
     sensor: Sensor = None,
     association: Association = "maximum_likelihood",
-    particles: _whole("how many hypotheses of the path") = 1000,
-    landmarks: _whole("slots of the map (64; known: one each)") | None = None,
+    particles: whole("how many hypotheses of the path") = 1000,
+    landmarks: whole("slots of the map (64; known: one each)") | None = None,
     params: ParamFile = None,
     paper: Paper = False,
     seed: Seed = 0,
-    out: _option(Path, "folder to write (runs/LOG-SENSOR-SEED)") | None = None,
+    out: option(Path, "folder to write (runs/LOG-SENSOR-SEED)") | None = None,
     overwrite: Overwrite = False,
 ):
     """Filter a log: trajectory, map, figures and errors in a folder.
@@ -90,7 +77,7 @@ def run(
 
     Example: jaxslam run lost-in-the-woods --particles 2000 --out runs/woods
     """
-    with _bar("reading"):
+    with bar("reading"):
         from jaxslam import report, runner
         from jaxslam.log import load_log
 
@@ -98,15 +85,15 @@ def run(
     model = _model(loaded, sensor, association, particles, landmarks, params, paper)
     out = out or Path("runs") / f"{Path(log).stem}-{model[0].sensor}-{seed}"
     report.check_target(out, overwrite)
-    with _bar("filtering") as progress:
+    with bar("filtering", compiles=True) as progress:
         result = runner.run(loaded, *model, seed, progress)
-    with _bar("writing"):
+    with bar("writing"):
         report.save(result, out, overwrite, log_source=log)
     print(report.error_table(report.summarise(result)))
     spent = f"{result.seconds:.1f} s, and {result.compile_seconds:.1f} s to compile"
     print(f"{len(result.time)} steps in {spent}\n{out}: the map is {out / 'map.png'}")
     for line in result.flags:
-        _warn(line)
+        warn(line)
     return int(bool(result.flags))
 
 
@@ -119,9 +106,9 @@ def compare(
     association: Association = "maximum_likelihood",
     params: ParamFile = None,
     paper: Paper = False,
-    particles: _option(str, "particle counts, by commas") = "20,100",
-    steps: _whole("frames to filter") = 200,
-    every: _whole("use each n-th frame (the steps cover a tenth)") | None = None,
+    particles: option(str, "particle counts, by commas") = "20,100",
+    steps: whole("frames to filter") = 200,
+    every: whole("use each n-th frame (the steps cover a tenth)") | None = None,
     seed: Seed = 0,
 ):
     """Show the filter beside the plain NumPy baseline: agreement, accuracy, time.
@@ -132,7 +119,7 @@ def compare(
     Example: jaxslam compare lost-in-the-woods --particles 20,100 --steps 200
     """
     counts = _counts(particles)
-    with _bar("reading"):
+    with bar("reading"):
         from jaxslam import compare as sides
         from jaxslam.log import load_log
 
@@ -140,19 +127,19 @@ def compare(
     rows = []
     for count in counts:
         model = _model(loaded, sensor, association, count, None, params, paper)
-        with _bar(f"{count} particles") as progress:
+        with bar(f"{count} particles", compiles=True) as progress:
             rows.append(sides.compare(loaded, *model, seed, steps, every, progress))
     print(sides.table(rows))
     parted = [row.double for row in rows if row.double.same < row.double.steps]
     for row in parted:
-        _warn(f"{row.particles} particles: the two part at step {row.same}")
+        warn(f"{row.particles} particles: the two part at step {row.same}")
     return int(bool(parted))
 
 
 @app.command(usage="Usage: jaxslam convert [OPTIONS] SRC... OUT.npz")
 def convert(
-    *paths: _option(Path, "files or folder to read, then the log to write"),
-    robot: _whole("which robot of an MRCLAM folder") | None = None,
+    *paths: option(Path, "files or folder to read, then the log to write"),
+    robot: whole("which robot of an MRCLAM folder") | None = None,
     overwrite: Overwrite = False,
 ):
     """Make a log of other people's files; their format is guessed.
@@ -168,14 +155,14 @@ def convert(
     if len(paths) < 2:
         raise ValueError("convert: what to read, and the .npz file to write, are needed")
     *sources, out = paths
-    _check_new(out, overwrite)
-    with _bar("reading"):
+    check_new(out, overwrite)
+    with bar("reading"):
         log = read(sources, robot)
     save_log(out, log)
     print(f"{out}: {log}; look at it with: jaxslam check {out}")
     lost = {why: n for why, n in log.skipped.items() if not why.startswith(NOT_USED)}
     for why, count in lost.items():
-        _warn(f"{count} rows skipped: {why}")
+        warn(f"{count} rows skipped: {why}")
     return int(bool(lost))
 
 
@@ -195,14 +182,14 @@ def check(log: LogName, /):
 
 
 @app.command
-def evaluate(folder: Folder, /, *, json: _option(bool, "as JSON") = False, log: MovedLog = None):
+def evaluate(folder: Folder, /, *, json: option(bool, "as JSON") = False, log: MovedLog = None):
     """Print the errors of a run against its log's truth.
 
     Example: jaxslam evaluate runs/demo --json
     """
     from json import dumps
 
-    with _bar("reading"):
+    with bar("reading"):
         from jaxslam import report
 
         errors = report.evaluate_folder(folder, log)
@@ -215,7 +202,7 @@ def plot(folder: Folder, /, *, log: MovedLog = None):
 
     Example: jaxslam plot runs/demo
     """
-    with _bar("drawing"):
+    with bar("drawing"):
         from jaxslam.plot import plot_folder
 
         paths = plot_folder(folder, log)
@@ -225,27 +212,27 @@ def plot(folder: Folder, /, *, log: MovedLog = None):
 
 @simulate.command
 def planar(
-    out: _option(Path, "the log to write, a .npz file"),
+    out: option(Path, "the log to write, a .npz file"),
     /,
     *,
-    world: _option(Worlds, "landmarks on the walls of 10 x 4 m, on a grid, or scattered") = "room",
+    world: option(Worlds, "landmarks on the walls of 10 x 4 m, on a grid, or scattered") = "room",
     seed: Seed = 0,
-    landmarks: _whole("point landmarks") = 40,
-    length: _option(float, "of the path [m]") = 60.0,
-    speed: _option(float, "[m/s]") = 0.5,
-    rate: _option(float, "frames per second [Hz]") = 5.0,
-    odometry_rate: _option(float, "odometry per second [Hz]") = 50.0,
-    commands: _option(bool, "stop and go: commands instead of odometry") = False,
-    stop: _option(float, "between two stops [m]") = 0.3,
-    err_tran: _option(float, "noise along the path [m/sqrt(m)]") = 0.02,
-    err_rot: _option(float, "noise of the heading, by turning [rad/sqrt(rad)]") = 0.02,
-    err_drift: _option(float, "noise of the heading, by driving [rad/sqrt(m)]") = 0.02,
-    sigma_range: _option(float, "noise of ranges [m]") = 0.05,
-    sigma_bearing: _option(float, "noise of bearings [rad]") = 0.02,
-    view_range: _option(float, "the sensor sees so far [m]") = 5.0,
-    detection: _option(float, "probability of being seen, at range 0") = 0.9,
-    outlier: _option(float, "probability of being clutter") = 0.02,
-    truth_resolution: _option(float, "truth is read off tiles of this size [m]") = 0.0,
+    landmarks: whole("point landmarks") = 40,
+    length: option(float, "of the path [m]") = 60.0,
+    speed: option(float, "[m/s]") = 0.5,
+    rate: option(float, "frames per second [Hz]") = 5.0,
+    odometry_rate: option(float, "odometry per second [Hz]") = 50.0,
+    commands: option(bool, "stop and go: commands instead of odometry") = False,
+    stop: option(float, "between two stops [m]") = 0.3,
+    err_tran: option(float, "noise along the path [m/sqrt(m)]") = 0.02,
+    err_rot: option(float, "noise of the heading, by turning [rad/sqrt(rad)]") = 0.02,
+    err_drift: option(float, "noise of the heading, by driving [rad/sqrt(m)]") = 0.02,
+    sigma_range: option(float, "noise of ranges [m]") = 0.05,
+    sigma_bearing: option(float, "noise of bearings [rad]") = 0.02,
+    view_range: option(float, "the sensor sees so far [m]") = 5.0,
+    detection: option(float, "probability of being seen, at range 0") = 0.9,
+    outlier: option(float, "probability of being clutter") = 0.02,
+    truth_resolution: option(float, "truth is read off tiles of this size [m]") = 0.0,
     overwrite: Overwrite = False,
 ):
     """Simulate a drive through a planar world, drawn from the filter's own model.
@@ -255,8 +242,8 @@ def planar(
     from jaxslam import simulate as worlds
     from jaxslam.log import save_log
 
-    _check_new(out, overwrite)
-    with _bar("simulating"):
+    check_new(out, overwrite)
+    with bar("simulating"):
         log = worlds.planar(
             world, seed, landmarks=landmarks, length_m=length, speed=speed, rate_hz=rate,
             odometry_hz=odometry_rate, commands=commands, stop_m=stop, err_tran=err_tran,
@@ -312,39 +299,8 @@ def _model(log, sensor, association, particles, landmarks, params, paper):
     return config, load_params(params, base) if params else base
 
 
-@contextmanager
-def _bar(what):
-    """A progress bar on stderr; gives a function of (done, total), or None without a terminal."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich import console, progress
-
-    with progress.Progress(console=console.Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=None)
-
-        def show(done, total):
-            text = what if done else f"{what}: compiling… (once)"
-            length = total if done else None  # None: it swings to and fro
-            bar.update(task, description=text, completed=done, total=length, refresh=True)
-
-        yield show
-
-
 def _counts(text):
     counts = [int(count) if count.isdecimal() else 0 for count in text.split(",")]
     if min(counts) < 1:
         raise ValueError(f"--particles is {text!r}; must be whole numbers from 1, like 20,100")
     return counts
-
-
-def _check_new(out, overwrite):
-    """Refuse a log's path that is no .npz file or is taken, before the work is done."""
-    if out.suffix != ".npz":
-        raise ValueError(f"{out}: a log is a .npz file; give its name last, as OUT.npz")
-    if out.exists() and not overwrite:
-        raise ValueError(f"{out}: exists; choose another name or add --overwrite")
-
-
-def _warn(text):
-    print(f"warning: {text}", file=sys.stderr)

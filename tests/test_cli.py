@@ -12,7 +12,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from jaxslam import cli, compare, report, runner, simulate
+from jaxslam import cli, compare, console, report, runner, simulate
 from jaxslam.log import load_log, save_log
 
 COMMANDS = ("demo", "run", "compare", "convert", "check", "evaluate", "plot")
@@ -387,12 +387,12 @@ def test_a_reader_that_goes_away_is_no_error(log):
 
 
 def test_a_terminal_gets_a_bar_and_a_file_does_not(capsys, monkeypatch):
-    with cli._bar("filtering") as show:
+    with console.bar("filtering", compiles=True) as show:
         assert show is None
     assert capsys.readouterr() == ("", "")
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    with cli._bar("filtering") as show:
+    with console.bar("filtering", compiles=True) as show:
         show(0, 8)
         show(4, 8)
     out, err = capsys.readouterr()

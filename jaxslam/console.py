@@ -1,0 +1,60 @@
+"""What the commands share: how options are declared, progress, warnings, refusing a taken name."""
+
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+DEMO = "lost-in-the-woods"
+
+
+def option(kind, text):
+    # A flag's default says nothing.
+    return Annotated[kind, Parameter(help=text, show_default=False if kind is bool else None)]
+
+
+def whole(text, least=1, most=10**9):
+    return Annotated[int, Parameter(help=text, validator=Number(gte=least, lte=most))]
+
+
+Seed = whole("of the random draws: the same seed, the same run", 0, 2**32 - 1)
+LogName = option(str, f"a .npz file, or {DEMO}")
+Overwrite = option(bool, "replace what is there")
+OutLog = option(Path, "the log to write, a .npz file")
+
+
+@contextmanager
+def bar(what, compiles=False):
+    """A progress bar on stderr; gives a function of (done, total), or None without a terminal.
+
+    `compiles`: until the first is done, JAX compiles.
+    """
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich import console, progress
+
+    with progress.Progress(console=console.Console(stderr=True), transient=True) as shown:
+        task = shown.add_task(what, total=None)
+
+        def show(done, total):
+            text = f"{what}: compiling… (once)" if compiles and not done else what
+            length = total if done else None  # None: it swings to and fro
+            shown.update(task, description=text, completed=done, total=length, refresh=True)
+
+        yield show
+
+
+def check_new(out, overwrite):
+    """Refuse a log's path that is no .npz file or is taken, before the work is done."""
+    if out.suffix != ".npz":
+        raise ValueError(f"{out}: a log is a .npz file; give its name last, as OUT.npz")
+    if out.exists() and not overwrite:
+        raise ValueError(f"{out}: exists; choose another name or add --overwrite")
+
+
+def warn(text):
+    print(f"warning: {text}", file=sys.stderr)
