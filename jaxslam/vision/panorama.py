@@ -1,0 +1,160 @@
+"""Other views of an omnidirectional image: panorama, perspective, bird's eye.
+
+Each is one cached table of where its pixels lie in the image, made from the calibrated camera, so
+that the misalignment of mirror, lens and mount is gone from the view.
+"""
+
+from functools import lru_cache
+from math import pi
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+LEAST_ROWS, MOST_ROWS = 16, 2048
+CACHED = 8  # views; a panorama of 1,440 columns takes 3 MB
+
+
+class Panorama(NamedTuple):
+    """Azimuth over elevation, evenly spaced in both, left on the left.
+
+    `azimuth` [W] rad, descending from pi to -pi: ahead is in the middle; `elevation` [H] rad,
+    descending; both at the pixels' centres. `map_x`, `map_y` float32 [H, W]: the place in the
+    image; `valid` bool [H, W]: it is in the image.
+    """
+
+    azimuth: np.ndarray
+    elevation: np.ndarray
+    map_x: np.ndarray
+    map_y: np.ndarray
+    valid: np.ndarray
+
+    @property
+    def step(self):
+        """Spacing [rad] of the columns."""
+        return 2 * pi / len(self.azimuth)
+
+    def bearing(self, column):
+        """Azimuth [rad] in (-pi, pi] of fractional columns, which may lie beyond the seam."""
+        return _wrapped(pi - (np.asarray(column) + 0.5) * self.step)
+
+    def column(self, bearing):
+        """Fractional column in [-0.5, W - 0.5) of an azimuth [rad]."""
+        return (pi - np.asarray(bearing)) % (2 * pi) / self.step - 0.5
+
+    def row(self, elevation):
+        """Fractional row of an elevation [rad]."""
+        spacing = self.elevation[0] - self.elevation[-1]
+        return (self.elevation[0] - np.asarray(elevation)) / spacing * (len(self.elevation) - 1)
+
+
+class View(NamedTuple):
+    """`map_x`, `map_y` float32 [H, W]: the place in the image; `valid` bool [H, W]: it is there."""
+
+    map_x: np.ndarray
+    map_y: np.ndarray
+    valid: np.ndarray
+
+
+@lru_cache(maxsize=CACHED)
+def panorama(camera, columns=1440, elevation=None):
+    """`Panorama` of a camera; cached, read-only.
+
+    `elevation` (low, high) [rad], None: the camera's. There are as many rows as the image has
+    pixels between the two. Raises `ValueError` where the camera sees nothing of it.
+    """
+    low, high = camera.elevation if elevation is None else elevation
+    if not (isinstance(columns, int) and 16 <= columns <= 1 << 14):
+        raise ValueError(f"panorama: {columns} columns; 16 to 16384 are allowed")
+    if not -pi / 2 <= low < high <= pi / 2:
+        raise ValueError(f"panorama: elevation {low:g}..{high:g} rad; must rise within +-pi/2")
+    low, high, rows = _extent(camera, low, high)
+    azimuth = pi - (np.arange(columns) + 0.5) * (2 * pi / columns)
+    edges = np.linspace(high, low, rows + 1)
+    up = (edges[1:] + edges[:-1]) / 2
+    view = _view(camera, _directions(azimuth[None, :], up[:, None]))
+    return Panorama(_fixed(azimuth), _fixed(up), *view)
+
+
+@lru_cache(maxsize=CACHED)
+def perspective(camera, azimuth=0.0, elevation=0.0, field=pi / 2, width=640, height=480):
+    """`View` of a pinhole camera that looks to (azimuth, elevation) [rad]; cached.
+
+    `field` [rad] is its horizontal angle of view. Black where the camera sees nothing.
+    """
+    if not 0 < field < pi:
+        raise ValueError(f"perspective: field {field:g} rad; must be within 0 to pi")
+    focal = width / 2 / np.tan(field / 2)
+    right = (np.arange(width) - (width - 1) / 2)[None, :]
+    down = (np.arange(height) - (height - 1) / 2)[:, None]
+    ahead = _directions(azimuth, elevation)
+    left = _directions(azimuth + pi / 2, 0.0)
+    up = np.cross(ahead, left)
+    direction = focal * ahead - right[..., None] * left - down[..., None] * up
+    return _view(camera, direction)
+
+
+@lru_cache(maxsize=CACHED)
+def birds_eye(camera, extent=4.0, size=512):
+    """`View` of the floor from above, ahead is up; cached.
+
+    `extent` [m]: half the side of the square round the robot's origin; `size` px. The camera's
+    height above the floor is its `position`. Black where it does not see the floor.
+    """
+    if camera.position[2] <= 0:
+        height = camera.position[2]
+        raise ValueError(f"birds_eye: the camera is {height:g} m above the floor; set its height")
+    metres = extent * (1 - (2 * np.arange(size) + 1) / size)
+    floor = np.stack([*np.meshgrid(metres, metres, indexing="ij"), np.zeros((size, size))], -1)
+    return _view(camera, floor - np.array(camera.position))
+
+
+def unwrap(image, view):
+    """The image [H, W] or [H, W, 3] seen as a `Panorama` or `View`; black outside the image."""
+    return cv2.remap(image, view.map_x, view.map_y, cv2.INTER_LINEAR)
+
+
+def _extent(camera, low, high):
+    """(low, high) [rad] that is seen from anywhere, and the pixels between them."""
+    up = np.linspace(low, high, 721)
+    azimuth = np.linspace(-pi, pi, 72, endpoint=False)
+    pixel = camera.project(_directions(azimuth[:, None], up[None, :]))
+    seen = np.flatnonzero(np.isfinite(pixel[..., 0]).any(0))
+    if len(seen) < 2:
+        raise ValueError(
+            f"panorama: the camera sees nothing at elevations of {np.degrees(low):.1f} to "
+            f"{np.degrees(high):.1f} deg; check its elevation, mirror and lens"
+        )
+    length = np.nansum(np.hypot(*np.moveaxis(np.diff(pixel, axis=1), -1, 0)), 1).max()
+    rows = int(np.clip(round(length), LEAST_ROWS, MOST_ROWS))
+    return up[seen[0]], up[seen[-1]], rows
+
+
+def _directions(azimuth, elevation):
+    """Unit directions [..., 3] of azimuths and elevations [rad]."""
+    azimuth, elevation = np.broadcast_arrays(azimuth, elevation)
+    level = np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], -1)
+
+
+def _view(camera, direction):
+    """`View` of directions [H, W, 3] of any length in the robot's frame."""
+    pixel = camera.project(direction)
+    up = np.arcsin(direction[..., 2] / np.linalg.norm(direction, axis=-1))
+    low, high = camera.elevation
+    with np.errstate(invalid="ignore"):
+        # between centres of pixels: beyond them there is nothing to interpolate with
+        valid = ((pixel >= 0) & (pixel <= np.array([camera.width, camera.height]) - 1)).all(-1)
+    valid &= (up >= low - 1e-9) & (up <= high + 1e-9)
+    pixel = np.where(valid[..., None], pixel, -2.0).astype(np.float32)
+    return View(_fixed(pixel[..., 0].copy()), _fixed(pixel[..., 1].copy()), _fixed(valid))
+
+
+def _fixed(array):
+    array.setflags(write=False)
+    return array
+
+
+def _wrapped(angle):
+    """The angle [rad] in (-pi, pi]."""
+    return pi - (pi - angle) % (2 * pi)
