@@ -266,9 +266,11 @@ def map_of(particle, sensor):
 
 def read_frame(measurements, t, model):
     """The valid measurements of frame t, in order, each with k, value [d], cov and identity."""
-    frame = []
+    frame, scale = [], getattr(measurements, "scale", None)
     for k in np.flatnonzero(np.asarray(measurements.valid[t])):
         value = np.array(measurements.value[t][k], float)[: 1 if model.sensor == "bearing" else 2]
+        if scale is not None and scale[t][k]:  # a position as much too small as the odometry is
+            value *= model.gain_tran
         xx, xy, yy = np.array(measurements.cov[t][k], float)
         cov, identity = np.array([[xx, xy], [xy, yy]]), int(measurements.identity[t][k])
         if model.association == "known" and identity < 0:

@@ -55,6 +55,16 @@ def _measurements(log):
     yield _say(n == 0, f"{n} measurements ({each})", "error")
     sensors = [name for name in ("position", "range_bearing", "bearing") if log.has(name)]
     yield Finding("ok", f"sensors it can supply: {', '.join(sensors)}")
+    if log.point is not None and n:
+        yield from _points(log)
+
+
+def _points(log):
+    given = np.isfinite(log.point[:, 0])
+    text = f"{given.sum()} of {len(given)} measurements have a point"
+    if log.point_baseline is not None and np.isfinite(log.point_baseline).any():
+        text += f", over {np.nanmedian(log.point_baseline):.2f} m of odometry in the median"
+    yield _say(not given.any(), text)
 
 
 def _odometry(log):
@@ -130,8 +140,8 @@ def _view(log):
     if log.has("position"):
         distance = log.range if log.range is not None else np.hypot(*log.point.T)
         outside |= distance > 1.05 * reach
-        far = float(distance.max())
-        yield _say(far > MOST_RANGE, f"ranges {distance.min():.2f}..{far:.2f} m", hint=hint)
+        far = float(np.nanmax(distance))
+        yield _say(far > MOST_RANGE, f"ranges {np.nanmin(distance):.2f}..{far:.2f} m", hint=hint)
     share = 100 * float(outside.mean())
     yield _say(share > 1.0, f"{share:.1f} % of measurements are outside the declared view")
 

@@ -122,7 +122,8 @@ def select(log, kept):
     number = np.full(len(log.frame_time), -1)
     number[kept] = np.arange(len(kept))
     rows = number[log.frame] >= 0
-    columns = ("bearing", "range", "point", "point_cov", "identity", "descriptor")
+    columns = ("bearing", "bearing_sigma", "range", "point", "point_cov", "point_baseline")
+    columns += ("identity", "descriptor")
     truth = log.truth
     if truth is not None and truth.identity is not None:
         truth = dataclasses.replace(truth, identity=truth.identity[rows])

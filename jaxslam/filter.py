@@ -109,6 +109,7 @@ def advance(chance, state, odometry, measurements, params, config):
     """`step` with its random numbers given: `chance` is the (normals, uniform) of `draws`."""
     normals, uniform = chance
     pose = jnp.stack(motion.sample(state.pose, odometry, params, normals))
+    measurements = sensors.rescaled(measurements, params)
     world, density, match, counts = _observe(
         pose, state.landmarks, measurements, params, config, state.step
     )

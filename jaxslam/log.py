@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxslam.arrays import assign, check_rows, check_stamps, checked, checked_number
 from jaxslam.config import Params
 
 SCHEMA = 1
@@ -26,7 +27,6 @@ MAX_BYTES = 1 << 30  # all entries together, unpacked
 MAX_ENTRIES = 1000
 MAX_DIMENSIONS = 4
 MAX_TEXT_BYTES = 1 << 16
-LAST_STAMP = 1 << 62  # ns; differences of two stamps still fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,23 +46,23 @@ class Truth:
     resolution: float = 0.0
 
     def __post_init__(self):
-        _set(self, "time", _array("truth.time", self.time, np.int64, (None,)))
+        assign(self, "time", checked("truth.time", self.time, np.int64, (None,)))
         poses = None if self.time is None else len(self.time)
-        _set(self, "pose", _array("truth.pose", self.pose, np.float64, (poses, 3)))
+        assign(self, "pose", checked("truth.pose", self.pose, np.float64, (poses, 3)))
         if (self.time is None) != (self.pose is None):
             raise ValueError("truth: time and pose must be given together")
         if self.time is not None:
-            _increasing("truth.time", self.time)
-        _set(self, "landmarks", _array("truth.landmarks", self.landmarks, np.float64, (None, 2)))
+            check_stamps("truth.time", self.time)
+        assign(self, "landmarks", checked("truth.landmarks", self.landmarks, np.float64, (None, 2)))
         count = 0 if self.landmarks is None else len(self.landmarks)
-        ids = _array("truth.landmark_id", self.landmark_id, np.int64, (count,))
+        ids = checked("truth.landmark_id", self.landmark_id, np.int64, (count,))
         if ids is not None and len(np.unique(ids)) != len(ids):
             raise ValueError("truth.landmark_id: the same id stands for two landmarks")
-        _set(self, "landmark_id", ids)
-        _set(self, "identity", _array("truth.identity", self.identity, np.int64, (None,)))
+        assign(self, "landmark_id", ids)
+        assign(self, "identity", checked("truth.identity", self.identity, np.int64, (None,)))
         if self.identity is not None:
-            _each("truth.identity", self.identity, self.identity >= -1, "must be -1 or more")
-        _set(self, "resolution", _number("truth.resolution", self.resolution, least=0))
+            check_rows("truth.identity", self.identity, self.identity >= -1, "must be -1 or more")
+        assign(self, "resolution", checked_number("truth.resolution", self.resolution, least=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +80,14 @@ class FloorPlan:
     def __post_init__(self):
         if self.segments is None and self.image is None:
             raise ValueError("plan: has neither segments nor an image")
-        _set(self, "segments", _array("plan.segments", self.segments, np.float64, (None, 4)))
-        _set(self, "image", _array("plan.image", self.image, np.uint8, (None, None)))
-        _set(self, "scale", _number("plan.scale", self.scale))
+        assign(self, "segments", checked("plan.segments", self.segments, np.float64, (None, 4)))
+        assign(self, "image", checked("plan.image", self.image, np.uint8, (None, None)))
+        assign(self, "scale", checked_number("plan.scale", self.scale))
         if self.scale <= 0:
             raise ValueError(f"plan.scale: {self.scale} m per pixel; must be above 0")
-        _set(self, "origin", tuple(_array("plan.origin", self.origin, np.float64, (2,)).tolist()))
+        assign(
+            self, "origin", tuple(checked("plan.origin", self.origin, np.float64, (2,)).tolist())
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -96,7 +98,10 @@ class Log:
     next) or "command" (distance m, then turn rad, executed in the interval that ends at its stamp).
     `frame_time` [F] is every time the sensor looked, also when it saw nothing; `frame` [n] is the
     frame of each measurement. `bearing` [n], `range` [n], `point` [n, 2] and `point_cov` [n, 3]
-    (xx, xy, yy) are in the sensor's frame; `identity` [n] is measured, -1 where none was.
+    (xx, xy, yy) are in the sensor's frame, NaN where a bearing has no point; `point_baseline` [n]
+    is the distance by odometry that a point's size rests on, NaN where it rests on none; so a gain
+    of the odometry rescales it. `bearing_sigma` [n] rad is the standard deviation of a bearing as
+    its detector states it. `identity` [n] is measured, -1 where none was.
     `view` (least bearing, largest bearing, largest range) is what the sensor can see, `mounting`
     (x, y, yaw) its pose on the robot, `time_offset` [s] what was added to the frames' stamps.
     `noise` declares values of `Params`. `start_pose`, `start_cov`: where the robot was at `start`.
@@ -112,9 +117,11 @@ class Log:
     frame_time: np.ndarray
     frame: np.ndarray
     bearing: np.ndarray | None = None
+    bearing_sigma: np.ndarray | None = None
     range: np.ndarray | None = None
     point: np.ndarray | None = None
     point_cov: np.ndarray | None = None
+    point_baseline: np.ndarray | None = None
     identity: np.ndarray | None = None
     descriptor: np.ndarray | None = None
     view: tuple[float, float, float]
@@ -135,9 +142,11 @@ class Log:
         _check_sensor(self)
         _check_start(self)
         if self.truth is not None and self.truth.identity is not None:
-            _array("truth.identity", self.truth.identity, np.int64, (len(self.frame),))
-        skipped = {str(k): _number(f"skipped/{k}", v, least=0) for k, v in self.skipped.items()}
-        _set(self, "skipped", {reason: int(count) for reason, count in skipped.items()})
+            checked("truth.identity", self.truth.identity, np.int64, (len(self.frame),))
+        skipped = {
+            str(k): checked_number(f"skipped/{k}", v, least=0) for k, v in self.skipped.items()
+        }
+        assign(self, "skipped", {reason: int(count) for reason, count in skipped.items()})
 
     def __repr__(self):
         rows = f"{len(self.odometry)} odometry rows, {len(self.frame_time)} frames"
@@ -151,131 +160,112 @@ class Log:
     def has(self, sensor):
         """Whether the log can supply a sensor: position, range_bearing or bearing."""
         bearing, both = self.bearing is not None, self.range is not None  # a range has a bearing
-        supplies = {"position": self.point is not None or both, "range_bearing": both}
+        supplies = {"position": self.has_points() or both, "range_bearing": both}
         return (supplies | {"bearing": bearing}).get(sensor, False)
+
+    def has_points(self):
+        """Whether some row has a point."""
+        return self.point is not None and bool((~np.isnan(self.point)).any() or not len(self.frame))
 
 
 def _check_odometry(log):
     if log.odometry_kind not in KINDS:
         raise ValueError(f"odometry_kind: {log.odometry_kind!r} is not one of {', '.join(KINDS)}")
-    _set(log, "odometry_time", _array("odometry_time", log.odometry_time, np.int64, (None,)))
+    assign(log, "odometry_time", checked("odometry_time", log.odometry_time, np.int64, (None,)))
     rows = len(log.odometry_time)
     if rows == 0:
         raise ValueError("odometry_time: the log has no odometry")
-    _increasing("odometry_time", log.odometry_time)
-    _set(log, "odometry", _array("odometry", log.odometry, np.float64, (rows, 2)))
+    check_stamps("odometry_time", log.odometry_time)
+    assign(log, "odometry", checked("odometry", log.odometry, np.float64, (rows, 2)))
 
 
 def _check_measurements(log):
-    _set(log, "frame_time", _array("frame_time", log.frame_time, np.int64, (None,)))
+    assign(log, "frame_time", checked("frame_time", log.frame_time, np.int64, (None,)))
     frames = len(log.frame_time)
     if frames == 0:
         raise ValueError("frame_time: the log has no frames")
-    _increasing("frame_time", log.frame_time)
-    frame = _array("frame", log.frame, np.int64, (None,))
-    _set(log, "frame", frame)
-    _each("frame", frame, (frame >= 0) & (frame < frames), f"must be in 0..{frames - 1}")
-    _each("frame", frame, np.diff(frame, prepend=frame[:1]) >= 0, "must not decrease")
+    check_stamps("frame_time", log.frame_time)
+    frame = checked("frame", log.frame, np.int64, (None,))
+    assign(log, "frame", frame)
+    check_rows("frame", frame, (frame >= 0) & (frame < frames), f"must be in 0..{frames - 1}")
+    check_rows("frame", frame, np.diff(frame, prepend=frame[:1]) >= 0, "must not decrease")
     n = len(frame)
     for name, dtype, shape in (
         ("bearing", np.float64, (n,)),
+        ("bearing_sigma", np.float64, (n,)),
         ("range", np.float64, (n,)),
         ("point", np.float64, (n, 2)),
         ("point_cov", np.float64, (n, 3)),
+        ("point_baseline", np.float64, (n,)),
         ("identity", np.int64, (n,)),
         ("descriptor", np.float32, (n, None)),
     ):
-        _set(log, name, _array(name, getattr(log, name), dtype, shape))
+        gaps = name.startswith("point")
+        assign(log, name, checked(name, getattr(log, name), dtype, shape, gaps))
     if log.bearing is None and log.point is None:
         raise ValueError("bearing: the log has neither bearings nor points")
-    for name, needs in (("range", "bearing"), ("point", "point_cov"), ("point_cov", "point")):
+    for name, needs in (
+        ("bearing_sigma", "bearing"),
+        ("range", "bearing"),
+        ("point", "point_cov"),
+        ("point_cov", "point"),
+        ("point_baseline", "point"),
+    ):
         if getattr(log, name) is not None and getattr(log, needs) is None:
             raise ValueError(f"{name}: given without {needs}")
     if log.bearing is not None:
         plausible = np.abs(log.bearing) <= 2 * math.pi
-        _each("bearing", log.bearing, plausible, "is beyond 2 pi rad (degrees? times pi/180)")
-    if log.range is not None:
-        _each("range", log.range, log.range > 0, "must be above 0 m")
-    if log.point_cov is not None:
-        xx, xy, yy = log.point_cov.T
-        definite = (xx > 0) & (yy > 0) & (xx * yy > xy * xy)
-        _each("point_cov", log.point_cov, definite, "is not positive definite")
+        check_rows("bearing", log.bearing, plausible, "is beyond 2 pi rad (degrees? times pi/180)")
+    for name in ("bearing_sigma", "range"):
+        value = getattr(log, name)
+        if value is not None:
+            check_rows(
+                name, value, value > 0, f"must be above 0 {'m' if name == 'range' else 'rad'}"
+            )
+    if log.point is not None:
+        _check_points(log)
     if log.identity is not None:
-        _each("identity", log.identity, log.identity >= -1, "must be -1 or more")
+        check_rows("identity", log.identity, log.identity >= -1, "must be -1 or more")
+
+
+def _check_points(log):
+    xx, xy, yy = log.point_cov.T
+    missing = np.isnan(xx)
+    definite = (xx > 0) & (yy > 0) & (xx * yy > xy * xy)
+    check_rows("point_cov", log.point_cov, definite | missing, "is not positive definite")
+    alike = np.isnan(log.point[:, 0]) == missing
+    check_rows("point", log.point, alike, "and its point_cov must both be given, or both be NaN")
+    if log.bearing is None:
+        check_rows("point", log.point, ~missing, "is no point, and the row has no bearing either")
+    if log.point_baseline is not None:
+        base = log.point_baseline
+        good = np.isnan(base) | ((base > 0) & ~missing)
+        check_rows("point_baseline", base, good, "must be above 0 m, and NaN without a point")
 
 
 def _check_sensor(log):
-    least, largest, reach = _array("view", log.view, np.float64, (3,)).tolist()
+    least, largest, reach = checked("view", log.view, np.float64, (3,)).tolist()
     # The filter compares with bearings in [-pi, pi); turn the mounting, not the view.
     if not -math.pi - 1e-9 <= least < largest <= math.pi + 1e-9 or reach <= 0:
         rule = "must be least and largest bearing within -pi..pi rad, and a range above 0 m"
         raise ValueError(f"view: {(least, largest, reach)} {rule}")
-    _set(log, "view", (least, largest, reach))
-    _set(log, "mounting", tuple(_array("mounting", log.mounting, np.float64, (3,)).tolist()))
-    _set(log, "time_offset", _number("time_offset", log.time_offset))
+    assign(log, "view", (least, largest, reach))
+    assign(log, "mounting", tuple(checked("mounting", log.mounting, np.float64, (3,)).tolist()))
+    assign(log, "time_offset", checked_number("time_offset", log.time_offset))
     for name in log.noise:
         if name not in Params._fields:
             allowed = ", ".join(Params._fields)
             raise ValueError(f"noise/{name}: no such parameter; allowed: {allowed}")
-    _set(log, "noise", {k: _number(f"noise/{k}", v) for k, v in log.noise.items()})
+    assign(log, "noise", {k: checked_number(f"noise/{k}", v) for k, v in log.noise.items()})
 
 
 def _check_start(log):
-    _set(log, "start_pose", _array("start_pose", log.start_pose, np.float64, (3,)))
-    cov = _array("start_cov", log.start_cov, np.float64, (3, 3))
+    assign(log, "start_pose", checked("start_pose", log.start_pose, np.float64, (3,)))
+    cov = checked("start_cov", log.start_cov, np.float64, (3, 3))
     size = max(np.abs(cov).max(), 1e-300)
     if np.abs(cov - cov.T).max() > 1e-9 * size or np.linalg.eigvalsh(cov)[0] < -1e-9 * size:
         raise ValueError("start_cov: is not a covariance (symmetric, no negative variance)")
-    _set(log, "start_cov", cov)
-
-
-def _set(owner, name, value):
-    object.__setattr__(owner, name, value)
-
-
-def _array(where, value, dtype, shape):
-    """`value` as a read-only array, or None; `shape` lists lengths, None where any is allowed."""
-    if value is None:
-        return None
-    try:
-        given = np.asarray(value)
-        with np.errstate(over="ignore"):
-            array = np.array(given, dtype, order="C")
-    except (TypeError, ValueError, OverflowError) as err:
-        raise ValueError(f"{where}: is not an array of numbers ({err})") from None
-    kinds = "iu" if array.dtype.kind in "iu" else "iuf"
-    if given.dtype.kind not in kinds and given.size:
-        raise ValueError(f"{where}: {given.dtype} is not {array.dtype}")
-    pairs = zip(shape, array.shape, strict=False)
-    if array.ndim != len(shape) or any(want not in (None, have) for want, have in pairs):
-        wanted = " x ".join("any" if w is None else str(w) for w in shape)
-        raise ValueError(f"{where}: shape {array.shape}; must be {wanted}")
-    if array.dtype.kind == "f":
-        _each(where, array, np.isfinite(array), "must be finite")
-    elif not np.array_equal(array, given):
-        raise ValueError(f"{where}: values do not fit {array.dtype}")
-    array.setflags(write=False)
-    return array
-
-
-def _each(where, array, good, rule):
-    """Raise for the first row that is not good."""
-    if not good.all():
-        row = int(np.argmin(good.reshape(len(good), -1).all(axis=1)))
-        raise ValueError(f"{where}, row {row}: {array[row].tolist()} {rule}")
-
-
-def _increasing(where, time):
-    _each(where, time, np.abs(time) < LAST_STAMP, "ns is no stamp")
-    step = np.diff(time, prepend=time[:1] - 1)
-    _each(where, time, step > 0, "repeats or precedes the stamp before it")
-
-
-def _number(where, value, least=-math.inf):
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not number or not math.isfinite(value) or value < least:
-        raise ValueError(f"{where}: {value!r} is not a finite number of at least {least}")
-    return float(value)
+    assign(log, "start_cov", cov)
 
 
 def save_log(path, log):

@@ -11,25 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.geometry import wrap
-
-
-class Odometry(NamedTuple):
-    """What the odometry says of one interval (or of T, stacked).
-
-    `dx, dy` [m] and `dtheta` [rad]: displacement in the robot's frame at the interval's start.
-    `distance` [m], `turn` [rad]: sums of absolute values. `duration` [s]. `lever`: mean fraction of
-    the path still ahead when the robot turned (0 for translate-then-rotate, 1/2 for an arc);
-    `lever_var`: its variance over the turning (0, 1/12).
-    """
-
-    dx: jax.Array
-    dy: jax.Array
-    dtheta: jax.Array
-    distance: jax.Array
-    turn: jax.Array
-    duration: jax.Array
-    lever: jax.Array
-    lever_var: jax.Array
+from jaxslam.odometry import Odometry as Odometry  # also found here
 
 
 class Motion(NamedTuple):

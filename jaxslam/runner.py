@@ -12,8 +12,9 @@ import numpy as np
 from jaxslam import filter as fastslam
 from jaxslam import landmarks as maps
 from jaxslam.config import Config, Params, default_params
-from jaxslam.frames import dead_reckoning, frames
+from jaxslam.frames import frames
 from jaxslam.log import NOT_USED, Log
+from jaxslam.odometry import dead_reckoning
 from jaxslam.paramfile import validate
 
 CHUNK = 256  # frames per compiled scan: one compilation serves logs of every length

@@ -27,7 +27,8 @@ class Measurements(NamedTuple):
 
     `value` [K, 2]: (range, bearing), (x, y) or (bearing, 0). `cov` [K, 3]: (xx, xy, yy) of a
     position, else zero. `identity` [K]: index of a measured identity, -1 if none. `valid` [K].
-    `active` []: whether the sensor looked at all.
+    `active` []: whether the sensor looked at all. `scale` [K]: 1 where a position's size rests on
+    odometry, else 0; None: nowhere.
     """
 
     value: jax.Array
@@ -35,6 +36,7 @@ class Measurements(NamedTuple):
     identity: jax.Array
     valid: jax.Array
     active: jax.Array
+    scale: jax.Array | None = None
 
 
 class Seen(NamedTuple):
@@ -45,6 +47,18 @@ class Seen(NamedTuple):
     noise: tuple
     range: jax.Array
     bearing: jax.Array
+
+
+def rescaled(measurements, params):
+    """The measurements with positions that rest on odometry in true metres: times `gain_tran`.
+
+    A triangle over a distance d is as much too small as d is. The covariances stay: the gain is
+    within per cents of 1.
+    """
+    if measurements.scale is None:
+        return measurements
+    gain = 1 + measurements.scale * (params.gain_tran - 1)
+    return measurements._replace(value=measurements.value * gain[:, None])
 
 
 def pose_of(pose, params):

@@ -56,6 +56,19 @@ def test_counts_and_rates_are_right():
         assert part in said
 
 
+def test_points_are_counted():
+    point = np.tile([2.0, 0.1], (20, 1))
+    cov, base = np.tile([0.1, 0.0, 0.1], (20, 1)), np.full(20, 0.4)
+    point[5:], cov[5:], base[5:] = np.nan, np.nan, np.nan
+    log = make(range=None, point=point, point_cov=cov, point_baseline=base)
+    said = " | ".join(texts(log, "ok"))
+    assert "5 of 20 measurements have a point, over 0.40 m of odometry in the median" in said
+    assert "ranges 2.00..2.00 m" in said
+    point[:], cov[:] = np.nan, np.nan
+    log = make(point=point, point_cov=cov)
+    assert "0 of 20 measurements have a point" in texts(log, "warning")
+
+
 def gap():
     time = np.arange(101) * S // 10
     time[50:] += 3 * S

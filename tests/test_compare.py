@@ -1,5 +1,6 @@
 """The filter against the baseline, fed the same draws; and the comparison itself."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import pytest
 
 from jaxslam import baseline, compare, simulate
 from jaxslam.config import ASSOCIATIONS, SENSORS, Config, default_params
+from jaxslam.frames import frames
 from jaxslam.log import load_log
 
 STEPS, PARTICLES = 200, 20
@@ -45,6 +47,22 @@ def test_baseline_and_filter_agree(woods, sensor, association):
     config = Config(sensor=sensor, association=association, forgetting=True, **SIZES)
     found = assert_agree(woods, config)
     assert found.clutter > 0 or (association == "maximum_likelihood" and sensor != "range_bearing")
+
+
+def test_baseline_and_filter_agree_on_points_that_rest_on_odometry(woods):
+    f = frames(woods, "position", params=default_params("position", woods))
+    cov = np.full((len(woods.frame), 3), np.nan)
+    point, base = cov[:, :2].copy(), cov[:, 0].copy()
+    rows = f.row[f.row >= 0]
+    value, cov[rows] = f.measurements.value[f.row >= 0], f.measurements.cov[f.row >= 0]
+    point[rows] = value / 1.05  # as triangles over odometry that is 5 % short
+    base[rows[::2]] = 0.4
+    point[rows[::7]], cov[rows[::7]], base[rows[::7]] = np.nan, np.nan, np.nan
+    log = replace(woods, point=point, point_cov=cov, point_baseline=base)
+    config = Config(sensor="position", forgetting=True, **SIZES)
+    plain = assert_agree(log, config)
+    scaled = assert_agree(replace(log, noise={"gain_tran": 1.05}), config)
+    assert np.abs(plain.pose_filter - scaled.pose_filter).max() > 0.01
 
 
 def test_baseline_and_filter_agree_on_the_papers_rules(woods):

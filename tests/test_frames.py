@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from jaxslam.config import Params, default_params
-from jaxslam.frames import dead_reckoning, frames, increments
+from jaxslam.frames import frames
 from jaxslam.log import Log, load_log
+from jaxslam.odometry import dead_reckoning, increments
 
 S = 10**9
 
@@ -279,6 +280,30 @@ def test_positions_of_the_log_itself_come_first():
     f = frames(five(point=points, point_cov=covs), "position", measurements=2)
     assert f.measurements.value[0].tolist() == [[1, 2], [3, 4]]  # the nearest two
     assert f.measurements.cov[2, 1].tolist() == [1, 0.5, 2]
+
+
+def test_bearings_without_a_point_are_no_positions_and_nothing_lost():
+    nan = np.nan
+    points, covs = np.arange(10.0).reshape(5, 2) + 1, np.tile([1, 0.5, 2], (5, 1))
+    points[[1, 3]], covs[[1, 3]] = nan, nan
+    log = five(point=points, point_cov=covs, point_baseline=[0.2, nan, nan, nan, 0.3])
+    f = frames(log, "position")
+    assert f.row[f.row >= 0].tolist() == [0, 2, 4]
+    assert np.isfinite(f.measurements.value).all()
+    assert np.isfinite(f.measurements.cov).all()
+    assert f.measurements.scale[f.row >= 0].tolist() == [1, 0, 1]
+    assert not f.measurements.scale[f.row < 0].any()
+    assert f.dropped == {}
+    assert frames(log, "bearing").measurements.scale is None
+    known = frames(log, "position", known=True)
+    identified = [row for row in (0, 2, 4) if log.identity[row] >= 0]
+    assert known.dropped.get("no identity", 0) == 3 - len(identified)
+
+
+def test_where_no_row_has_a_point_positions_are_made_of_ranges():
+    gaps = {"point": np.full((5, 2), np.nan), "point_cov": np.full((5, 3), np.nan)}
+    made = frames(five(**gaps), "position").measurements
+    assert made.value == pytest.approx(frames(five(), "position").measurements.value)
 
 
 def test_no_measurements_at_all():

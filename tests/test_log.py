@@ -12,6 +12,7 @@ from jaxslam import log as log_module
 from jaxslam.log import FloorPlan, Log, Truth, load_log, save_log
 
 S = 10**9
+GAP = [np.nan] * 3
 
 
 def make(**changes):
@@ -34,8 +35,10 @@ def full():
     truth = Truth([0, S], [[0, 0, 0], [1, 0, 0.5]], [[1, 2]], [7], [7, -1, 7], 0.3)
     plan = FloorPlan([[0, 0, 1, 0]], np.arange(6, dtype=np.uint8).reshape(2, 3), 0.05, (-1.0, 2.0))
     return make(
-        point=[[1, 2], [3, 4], [5, 6]],
-        point_cov=[[1, 0.1, 1]] * 3,
+        point=[[1, 2], GAP[:2], [5, 6]],
+        point_cov=[[1, 0.1, 1], GAP, [1, 0.1, 1]],
+        point_baseline=[0.4, np.nan, np.nan],
+        bearing_sigma=[0.002, 0.003, 0.1],
         descriptor=np.ones((3, 4), np.float32),
         mounting=(0.2, 0.0, 0.1),
         time_offset=-0.05,
@@ -55,7 +58,7 @@ def assert_same(a, b):
             assert_same(left, right)
         elif isinstance(left, np.ndarray):
             assert left.dtype == right.dtype, item.name
-            assert np.array_equal(left, right), item.name
+            assert np.array_equal(left, right, equal_nan=left.dtype.kind == "f"), item.name
         else:
             assert left == right, item.name
 
@@ -93,6 +96,13 @@ def test_plain_numpy_writes_a_log(tmp_path):
     assert log.truth.pose is None
     assert not log.has("range_bearing")
     assert not log.has("position")
+
+
+def test_a_log_whose_lines_have_no_point_supplies_no_position():
+    gaps = {"point": [GAP[:2]] * 3, "point_cov": [GAP] * 3, "point_baseline": GAP}
+    assert not make(range=None, **gaps).has("position")
+    assert make(**gaps).has("position")  # by range and bearing
+    assert full().has("position")
 
 
 def test_arrays_are_read_only_copies():
@@ -156,6 +166,34 @@ BAD = {
     "cov": (
         {"point": [[1, 1]] * 3, "point_cov": [[1, 2, 1]] * 3},
         "point_cov, row 0: .* positive definite",
+    ),
+    "half a point": (
+        {"point": [[1, np.nan]] + [[1, 1]] * 2, "point_cov": [[1, 0, 1]] * 3},
+        "point, row 0: .* must be finite, or nothing but NaN",
+    ),
+    "point without cov": (
+        {"point": [[1, 1]] * 3, "point_cov": [[1, 0, 1]] * 2 + [GAP]},
+        "point, row 2: .* must both be given",
+    ),
+    "nothing in a row": (
+        {"bearing": None, "range": None}
+        | {"point": [[1, 1]] * 2 + [GAP[:2]], "point_cov": [[1, 0, 1]] * 2 + [GAP]},
+        "point, row 2: .* no bearing either",
+    ),
+    "baseline": (
+        {"point": [[1, 1]] * 3, "point_cov": [[1, 0, 1]] * 3, "point_baseline": [1.0, 0.0, 1.0]},
+        "point_baseline, row 1: 0.0 must be above 0 m",
+    ),
+    "baseline of nothing": (
+        {"point": [[1, 1]] * 2 + [GAP[:2]], "point_cov": [[1, 0, 1]] * 2 + [GAP]}
+        | {"point_baseline": [1.0, 1.0, 1.0]},
+        "point_baseline, row 2: .* NaN without a point",
+    ),
+    "baseline alone": ({"point_baseline": [1.0] * 3}, "point_baseline: given without point"),
+    "sigma": ({"bearing_sigma": [0.1, 0.0, 0.1]}, "bearing_sigma, row 1: 0.0 must be above 0 rad"),
+    "sigma NaN": (
+        {"bearing_sigma": [0.1, np.nan, 0.1]},
+        "bearing_sigma, row 1: nan must be finite",
     ),
     "identity": ({"identity": [1, 2, -2]}, "identity, row 2"),
     "descriptor": ({"descriptor": np.ones(3)}, "descriptor: shape"),

@@ -29,6 +29,20 @@ def test_the_mounting_puts_the_sensor_on_the_robot():
     np.testing.assert_allclose(got, [1.1, 2.2, np.pi / 2 + 0.3], atol=1e-6)
 
 
+def test_a_translation_gain_rescales_positions_that_rest_on_odometry():
+    value = jnp.array([[2.0, 1.0], [3.0, -1.0]])
+    scale = jnp.array([1.0, 0.0])
+    frame = sensors.Measurements(value, jnp.ones((2, 3)), None, None, None, scale)
+
+    def total(gain):
+        return sensors.rescaled(frame, PARAMS._replace(gain_tran=gain)).value
+
+    np.testing.assert_allclose(total(1.1), [[2.2, 1.1], [3.0, -1.0]], rtol=1e-6)
+    np.testing.assert_allclose(jax.jacobian(total)(1.1), [[2.0, 1.0], [0.0, 0.0]])
+    unscaled = frame._replace(scale=None)
+    assert sensors.rescaled(unscaled, PARAMS._replace(gain_tran=2.0)) is unscaled
+
+
 @pytest.mark.parametrize("sensor", SENSORS)
 @pytest.mark.parametrize("seed", range(5))
 def test_jacobian_against_finite_differences(x64, sensor, seed):

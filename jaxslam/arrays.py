@@ -1,0 +1,68 @@
+"""Values checked as they are taken in: arrays, rows, stamps, numbers; one-line errors.
+
+Every error names the field, the row, what was found and what is allowed.
+"""
+
+import math
+
+import numpy as np
+
+LAST_STAMP = 1 << 62  # ns; differences of two stamps still fit
+
+
+def assign(owner, name, value):
+    """Set a field of a frozen dataclass while it is being made."""
+    object.__setattr__(owner, name, value)
+
+
+def checked(where, value, dtype, shape, gaps=False):
+    """`value` as a read-only array, or None; `shape` lists lengths, None where any is allowed.
+
+    `gaps`: a row may be NaN altogether.
+    """
+    if value is None:
+        return None
+    try:
+        given = np.asarray(value)
+        with np.errstate(over="ignore"):
+            array = np.array(given, dtype, order="C")
+    except (TypeError, ValueError, OverflowError) as err:
+        raise ValueError(f"{where}: is not an array of numbers ({err})") from None
+    kinds = "iu" if array.dtype.kind in "iu" else "iuf"
+    if given.dtype.kind not in kinds and given.size:
+        raise ValueError(f"{where}: {given.dtype} is not {array.dtype}")
+    pairs = zip(shape, array.shape, strict=False)
+    if array.ndim != len(shape) or any(want not in (None, have) for want, have in pairs):
+        wanted = " x ".join("any" if w is None else str(w) for w in shape)
+        raise ValueError(f"{where}: shape {array.shape}; must be {wanted}")
+    if array.dtype.kind == "f":
+        good = np.isfinite(array)
+        if gaps:
+            good |= np.isnan(array).all(axis=tuple(range(1, array.ndim)), keepdims=True)
+        check_rows(where, array, good, "must be finite" + ", or nothing but NaN" * gaps)
+    elif not np.array_equal(array, given):
+        raise ValueError(f"{where}: values do not fit {array.dtype}")
+    array.setflags(write=False)
+    return array
+
+
+def check_rows(where, array, good, rule):
+    """Raise for the first row that is not good."""
+    if not good.all():
+        row = int(np.argmin(good.reshape(len(good), -1).all(axis=1)))
+        raise ValueError(f"{where}, row {row}: {array[row].tolist()} {rule}")
+
+
+def check_stamps(where, time):
+    """Raise for the first stamp that does not follow the one before it."""
+    check_rows(where, time, np.abs(time) < LAST_STAMP, "ns is no stamp")
+    step = np.diff(time, prepend=time[:1] - 1)
+    check_rows(where, time, step > 0, "repeats or precedes the stamp before it")
+
+
+def checked_number(where, value, least=-math.inf):
+    """`value` as a float; raise for what is no number, not finite or below `least`."""
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if not number or not math.isfinite(value) or value < least:
+        raise ValueError(f"{where}: {value!r} is not a finite number of at least {least}")
+    return float(value)
