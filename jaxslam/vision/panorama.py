@@ -72,7 +72,7 @@ def panorama(camera, columns=1440, elevation=None):
     azimuth = pi - (np.arange(columns) + 0.5) * (2 * pi / columns)
     edges = np.linspace(high, low, rows + 1)
     up = (edges[1:] + edges[:-1]) / 2
-    view = _view(camera, _directions(azimuth[None, :], up[:, None]))
+    view = _view(camera, directions(azimuth[None, :], up[:, None]))
     return Panorama(_fixed(azimuth), _fixed(up), *view)
 
 
@@ -87,8 +87,8 @@ def perspective(camera, azimuth=0.0, elevation=0.0, field=pi / 2, width=640, hei
     focal = width / 2 / np.tan(field / 2)
     right = (np.arange(width) - (width - 1) / 2)[None, :]
     down = (np.arange(height) - (height - 1) / 2)[:, None]
-    ahead = _directions(azimuth, elevation)
-    left = _directions(azimuth + pi / 2, 0.0)
+    ahead = directions(azimuth, elevation)
+    left = directions(azimuth + pi / 2, 0.0)
     up = np.cross(ahead, left)
     direction = focal * ahead - right[..., None] * left - down[..., None] * up
     return _view(camera, direction)
@@ -118,7 +118,7 @@ def _extent(camera, low, high):
     """(low, high) [rad] that is seen from anywhere, and the pixels between them."""
     up = np.linspace(low, high, 721)
     azimuth = np.linspace(-pi, pi, 72, endpoint=False)
-    pixel = camera.project(_directions(azimuth[:, None], up[None, :]))
+    pixel = camera.project(directions(azimuth[:, None], up[None, :]))
     seen = np.flatnonzero(np.isfinite(pixel[..., 0]).any(0))
     if len(seen) < 2:
         raise ValueError(
@@ -130,7 +130,7 @@ def _extent(camera, low, high):
     return up[seen[0]], up[seen[-1]], rows
 
 
-def _directions(azimuth, elevation):
+def directions(azimuth, elevation):
     """Unit directions [..., 3] of azimuths and elevations [rad]."""
     azimuth, elevation = np.broadcast_arrays(azimuth, elevation)
     level = np.cos(elevation)
