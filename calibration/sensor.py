@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calibration.likelihood import maximum_likelihood
-from calibration.odometry import GAP, LEAST, ODOMETRY, fit_odometry, require
+from calibration.odometry import GAP, LEAST, fit_odometry, require
 from jaxslam.evaluate import truth_at, wrap
 
 COARSEST = 0.02  # m; truth read off anything coarser tells nothing of these errors
@@ -61,8 +61,9 @@ def fit(log, interval=1.0):
     Sensor: `sigma_range` (about zero; where there are ranges), `sigma_bearing`, `growth`,
     `mount_yaw`, and `outlier`: the share beyond 5 robust standard deviations of their range bin, or
     of no landmark by the truth. Odometry, in intervals of about `interval` seconds: `err_tran`,
-    `err_rot`, `err_drift`, `gain_tran`, `gain_rot`, `bias_drift`; the floors and the mounting's x
-    and y stay as the log declares them. Raises `ValueError` naming what the log lacks.
+    `err_rot`, `err_drift`, `gain_tran`, `gain_rot`, `bias_drift`, those of turns only if there are
+    some; the floors and the mounting's x and y stay as the log declares them. Raises `ValueError`
+    naming what the log lacks.
     """
     if not 0 < interval < np.inf:
         raise ValueError(f"interval: {interval!r} s; must be above 0")
@@ -71,11 +72,10 @@ def fit(log, interval=1.0):
     fine = f"true poses finer than {COARSEST:g} m (they have {truth.resolution:g} m)"
     require(log, truth.resolution <= COARSEST, fine)
     values, errors, counts, by_range = _fit_sensor(log)
-    (*best, drive_yaw), (*error, yaw_error), counts["intervals"] = fit_odometry(log, interval)
-    values |= zip(ODOMETRY, best, strict=True)
-    errors |= zip(ODOMETRY, error, strict=True)
-    values, errors = ({k: float(v) for k, v in part.items()} for part in (values, errors))
-    return ErrorModel(values, errors, counts, by_range, interval, (drive_yaw, yaw_error))
+    driven, uncertain, drive_yaw, counts["intervals"] = fit_odometry(log, interval)
+    values, errors = ({k: float(v) for k, v in part.items()}
+                      for part in (values | driven, errors | uncertain))  # fmt: skip
+    return ErrorModel(values, errors, counts, by_range, interval, drive_yaw)
 
 
 def turn_frame(log, yaw):

@@ -47,7 +47,7 @@ def plot(result, directory):
     for name, draw in zip(FIGURES, (draw_map, draw_error, draw_particles), strict=True):
         with matplotlib.rc_context(STYLE):
             figure = draw(result)
-            paths.append(_write(figure, directory / name))
+            paths.append(write_figure(figure, directory / name))
     return paths
 
 
@@ -289,7 +289,7 @@ def _time_axis(axes, seconds):
     axes.set(xlabel="time [s]", xlim=(0, max(seconds[-1:].max(initial=0), 1e-3)))
 
 
-def _write(figure, path):
+def write_figure(figure, path):
     """Save a figure as PNG, whole or not at all."""
     partial = path.with_name(f".{path.name}.{token_hex(4)}")
     try:

@@ -204,7 +204,7 @@ def without(log, **parts):
         (lambda log: replace(log, bearing=None, range=None, point=np.ones((len(log.frame), 2)),
                              point_cov=np.tile([1.0, 0, 1], (len(log.frame), 1))), "bearings"),
         (lambda log: without(log, identity=np.full(len(log.frame), 999)), "30 measurements"),
-        (lambda log: replace(log, odometry=np.zeros_like(log.odometry)), "1 m driven and 1 rad"),
+        (lambda log: replace(log, odometry=np.zeros_like(log.odometry)), "1 m driven"),
         (lambda log: replace(log, odometry=log.odometry[:9], odometry_time=log.odometry_time[:9]),
          "odometry and true poses together"),
     ],

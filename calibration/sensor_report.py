@@ -1,0 +1,116 @@
+"""What a calibration drive tells of the sensor: text, parameters, and the paper's fig. 6."""
+
+from typing import NamedTuple
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from calibration.points import Model, PointErrors, compare, identified, point_errors
+from calibration.sensor import ErrorModel, fit
+from jaxslam.config import UNITS, Params
+from jaxslam.evaluate import truth_at
+from jaxslam.plot import FILTER, LANDMARK, STYLE, TRUE, ellipses, write_figure
+
+SHOWN = 250  # points drawn at most: more would cover each other
+
+
+class SensorReport(NamedTuple):
+    """`bearing`: noise of bearings and odometry; `errors` and `models` of the triangulated points,
+    None and empty where the log has no points."""
+
+    bearing: ErrorModel
+    errors: PointErrors | None
+    models: list[Model]
+
+
+def calibrate_sensor(log):
+    """`SensorReport` of a drive with true poses and surveyed lines; raises `ValueError`.
+
+    Lines that nobody has labelled are named by the surveyed line at their bearing.
+    """
+    unnamed = log.identity is None and (log.truth is None or log.truth.identity is None)
+    named = identified(log) if unnamed else log
+    bearing = fit(named)
+    if not log.has("position") or log.point is None:
+        return SensorReport(bearing, None, [])
+    errors = point_errors(named, bearing.values["gain_tran"])
+    return SensorReport(bearing, errors, compare(errors))
+
+
+def values(report):
+    """Values of `Params` that were found and their standard errors, two dicts by name.
+
+    The mounting stays as declared: it is the camera's.
+    """
+    found = {k: v for k, v in report.bearing.values.items() if not k.startswith("mount")}
+    errors = {k: v for k, v in report.bearing.standard_errors.items() if k in found}
+    for model in report.models:
+        if model.name == "propagated normal":
+            found["position_scale"] = model.values["position_scale"]
+    return {k: v for k, v in found.items() if k in Params._fields}, errors
+
+
+def text(report):
+    """The tables that `jaxslam calibrate sensor` prints."""
+    found, errors = values(report)
+    lines = [f"{'parameter':<16}{'value':>11}{'std. error':>12}  unit"]
+    for name, value in found.items():
+        error = f"{errors[name]:.2g}" if name in errors else ""
+        lines.append(f"{name:<16}{value:>11.5g}{error:>12}  {UNITS[name]}")
+    if report.models:
+        lines += ["", _counted(report.errors), ""]
+        lines.append(f"{'error model of a point':<24}{'nats/point':>11}{'in 95 %':>9}  parameters")
+        for model in report.models:
+            shown = ", ".join(f"{k} {v:.4g}" for k, v in model.values.items())
+            row = f"{model.name:<24}{model.held_out:>11.3f}{100 * model.coverage:>8.1f}%  {shown}"
+            lines.append(row)
+        best, second = report.models[:2]
+        gap = best.held_out - second.held_out
+        lines.append(f"preferred: {best.name}, by {gap:.3f} nats per held-out point")
+    return "\n".join(lines)
+
+
+def _counted(errors):
+    off = np.linalg.norm(errors.point - errors.true, axis=1)
+    counts = ", ".join(f"{count} {what}" for what, count in errors.counts.items())
+    median, most = np.median(off), np.quantile(off, 0.95)
+    return f"{counts}; error {100 * median:.1f} cm in the median, {100 * most:.1f} cm at 95 %"
+
+
+def draw(report, log, path):
+    """Draw the paper's fig. 6 in the world's frame: surveyed lines, 95 % ellipses, estimates.
+
+    Raises `ValueError` without points or when the file can't be written.
+    """
+    if report.errors is None:
+        raise ValueError(f"{log.name}: has no triangulated points to draw")
+    chosen = np.unique(np.linspace(0, len(report.errors.row) - 1, SHOWN).astype(int))
+    errors = report.errors.part(chosen)
+    pose = _sensor_poses(log)[errors.frame]
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    turn = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], 1)
+    point, true = (pose[:, :2] + (turn @ p[..., None])[..., 0] for p in (errors.point, errors.true))
+    cov = turn @ errors.cov @ turn.transpose(0, 2, 1)
+    outline = ellipses(point, cov[:, [0, 0, 1], [0, 1, 1]], np.sqrt(-2 * np.log(0.05)))
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(9, 6), layout="constrained")
+        axes = figure.add_subplot()
+        axes.plot(*outline.transpose(2, 1, 0), color=FILTER, lw=0.5, alpha=0.5)
+        axes.plot(*point.T, "+", ms=5, color=FILTER, label="triangulated, 95 % ellipse")
+        axes.plot(*true.T, "o", ms=8, mfc="none", mec=LANDMARK, label="surveyed line")
+        axes.plot(*_sensor_poses(log)[:, :2].T, ".", ms=3, color=TRUE, label="image taken")
+        axes.set(xlabel="x [m]", ylabel="y [m]", title="Points triangulated on a straight drive")
+        axes.set_aspect("equal")
+        low, high = np.min(true, axis=0) - 0.6, np.max(true, axis=0) + 0.6
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        return write_figure(figure, path)
+
+
+def _sensor_poses(log):
+    """True sensor poses [F, 3] at the frames."""
+    pose = truth_at(log.truth, log.frame_time)
+    mx, my, yaw = log.mounting
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    return pose + np.column_stack([c * mx - s * my, s * mx + c * my, np.full(len(pose), yaw)])
