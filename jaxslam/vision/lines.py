@@ -15,6 +15,7 @@ import numpy as np
 from jaxslam.vision.edges import PAD, find_edges
 from jaxslam.vision.panorama import panorama, unwrap
 
+SHARP = 2.0
 REACH = 3  # columns on either side of an edge that its place is found from
 BLOCK = 6  # rows judged together
 BESIDE = (2, 3, 4)  # columns away from the edge whose mean is the colour beside it
@@ -36,7 +37,7 @@ class LineSettings:
 
     columns: int = 1440
     elevation: tuple[float, float] | None = None
-    contrast: float = 1.5
+    contrast: float = 0.05
     significance: float = 4.0
     length: float = 0.12
     gap: float = 0.03
@@ -44,6 +45,7 @@ class LineSettings:
     merge_bearing: float = 0.006
     merge_gap: float = 0.5
     floor: float = 0.0005
+    sharpness: float = 0.5
     merge: bool = True
     colour: bool = True
 
@@ -98,8 +100,9 @@ def lines_of_panorama(picture, view, settings):
     seen = picture if settings.colour else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)[..., None]
     spacing = (view.elevation[0] - view.elevation[-1]) / (len(view.elevation) - 1)
     length, gap = (max(2, round(angle / spacing)) for angle in (settings.length, settings.gap))
+    level = max(float(np.mean(cv2.mean(seen, view.valid.view(np.uint8))[: seen.shape[2]])), 1.0)
     edges = find_edges(
-        seen, view.valid, settings.contrast, settings.significance, length, gap, settings.slope
+        seen, view.valid, settings.contrast * level, settings.significance, length, gap, settings.slope
     )
     lines = _lines(edges, picture, view, settings)
     if settings.merge:
@@ -116,9 +119,11 @@ def _lines(edges, picture, view, settings):
     """`Lines` of the segments that stand upright, each once (the seam's repeat left out)."""
     n = int(edges.segment.max(initial=-1)) + 1
     slope = _slopes(edges, n)
-    column, scatter, sign, strength = _placed(edges, n)
+    column, scatter, sign, strength, sharp = _placed(edges, n, columns_per_pixel(view))
     width = picture.shape[1]
     keep = (np.abs(slope) <= settings.slope) & np.isfinite(column)
+    if n:
+        keep &= sharp >= settings.sharpness * np.median(sharp)
     keep &= (column >= PAD - 0.5) & (column < PAD + width - 0.5)
     first, last = _ends(edges, n)
     half = 0.5 * (view.elevation[0] - view.elevation[-1]) / (len(view.elevation) - 1)
@@ -148,7 +153,16 @@ def _ends(edges, n):
     return edges.row[np.concatenate([[0], ends[:-1]]).astype(int)[:n]], edges.row[ends - 1]
 
 
-def _placed(edges, n):
+def columns_per_pixel(view, stride=90):
+    """How many columns [H] a pixel of the image is wide in each row of a `Panorama`."""
+    x, y = (part[:, ::stride].astype(float) for part in (view.map_x, view.map_y))
+    nx, ny = (part[:, 1::stride].astype(float) for part in (view.map_x, view.map_y))
+    n = min(x.shape[1], nx.shape[1])
+    width = np.median(np.hypot(nx[:, :n] - x[:, :n], ny[:, :n] - y[:, :n]), axis=1)
+    return 1 / np.maximum(width, 1e-3)
+
+
+def _placed(edges, n, wide):
     """Column, its standard deviation, sign of the gradient and strength [n] of the segments.
 
     The gradients of a segment's rows lie along one line in colour space (its principal axis); the
@@ -156,13 +170,25 @@ def _placed(edges, n):
     """
     segment = edges.segment
     centre = np.rint(np.bincount(segment, edges.column, n) / np.bincount(segment, minlength=n))
-    centre = np.clip(centre, REACH, edges.along.shape[1] - 1 - REACH).astype(int)
+    centre = np.clip(centre, PAD - 4, edges.along.shape[1] - 1 - (PAD - 4)).astype(int)
     at = edges.along[edges.row, np.rint(edges.column).astype(int)].astype(float)
     axis = _principal(at, segment, n)
     along = np.einsum("ec,ec->e", at, axis[segment])
     reach = np.arange(-REACH, REACH + 1)
     across = edges.gradient[edges.row[:, None], centre[segment][:, None] + reach]
     across = np.einsum("ekc,ec->ek", across, axis[segment] * np.sign(along)[:, None])
+    far = np.clip(np.rint(SHARP * wide), 2, PAD - 4).astype(int)[edges.row]
+    beyond = [
+        np.einsum(
+            "ec,ec->e",
+            edges.along[edges.row, centre[segment] + sign * far],
+            axis[segment] * np.sign(along)[:, None],
+        )
+        for sign in (-1, 1)
+    ]
+    sharp = 1 - np.bincount(segment, np.add(*beyond) / 2, n) / np.bincount(
+        segment, np.abs(along), n
+    )
     first, _ = _ends(edges, n)
     block = (edges.row - first[segment]) // BLOCK
     _, start, block = np.unique(
@@ -175,7 +201,7 @@ def _placed(edges, n):
     offset, scatter = _peak(profile, owner, top, n)
     sign = np.where(np.bincount(segment, along, n) >= 0, 1, -1)
     strength = np.sqrt(np.bincount(segment, along**2, n))
-    return centre + top - REACH + offset, scatter, sign, strength
+    return centre + top - REACH + offset, scatter, sign, strength, sharp
 
 
 def _principal(vectors, owner, n):

@@ -1,0 +1,200 @@
+"""How far the camera's axis leans from gravity, from the vertical lines of ordinary images.
+
+Lines that are vertical in the world all lie in planes through the camera that contain "up". So up
+is what is perpendicular to the normals of the planes of many lines: a robust least squares problem
+in two unknowns. Lines are looked for with a generous slope first, then again in views that are
+nearly upright. Images should come from several places: what leans in a room leans in every image
+of it taken from one place.
+"""
+
+from dataclasses import dataclass, replace
+from math import degrees
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.vision.camera import tilt_matrix
+from jaxslam.vision.edges import PAD, find_edges
+from jaxslam.vision.images import check_size
+from jaxslam.vision.panorama import directions, panorama, unwrap
+
+PASSES = ((0.12, 0.25), (0.02, 0.1), (0.01, 0.08))  # tilt [rad] and slope [columns per row] allowed
+LENGTH, GAP = 0.18, 0.03  # rad, of the lines used
+CONTRAST, SIGNIFICANCE = 2.0, 5.0  # see `LineSettings`
+LEAST_LINES = 12
+LEAST_PER_IMAGE = 5  # lines, for an estimate from one image alone
+BLOCK, FLOOR = 7, 0.1  # rows whose peaks go together; columns, error of their mean at best
+GRID = 41  # trial tilts each way
+SPREAD = 0.004  # rad: how far from its plane up may be for a line that is vertical, at the start
+BIWEIGHT = 4.685  # robust standard deviations
+
+
+@dataclass(frozen=True, eq=False)
+class Tilt:
+    """`roll` and `pitch` [rad] of the camera as a `Camera` takes them, `covariance` [2, 2] of them.
+
+    `lines` used of `candidates` in `images` images; `per_image` (name, roll, pitch, lines) of those
+    with enough of their own; `scatter` [rad] of a line about the result; `skipped` images by reason.
+    """
+
+    roll: float
+    pitch: float
+    covariance: np.ndarray
+    lines: int
+    candidates: int
+    images: int
+    scatter: float
+    per_image: list[tuple[str, float, float, int]]
+    skipped: dict[str, int]
+
+
+class Normals(NamedTuple):
+    """`normal` [n, 3] of the lines' planes in the robot's frame, `sigma` [n] rad, `image` [n]."""
+
+    normal: np.ndarray
+    sigma: np.ndarray
+    image: np.ndarray
+
+
+def tilt(images, camera, progress=None):
+    """`Tilt` of a camera from images: an `Images` or a list of (name, image or `ValueError`).
+
+    Raises `ValueError` when there are too few vertical lines, or all on one side.
+    """
+    for step, (most, slope) in enumerate(PASSES):
+        skipped, names = {}, []
+        found, used = [], 0
+        for done, (name, image) in enumerate(images):
+            names.append(name)
+            try:
+                if isinstance(image, ValueError):
+                    raise image
+                check_size(image, camera, name)
+            except ValueError as error:
+                reason = str(error).removeprefix(f"{name}: ")
+                skipped[reason] = skipped.get(reason, 0) + 1
+                continue
+            found.append(_normals(image, camera, slope, done))
+            used += 1
+            if progress:
+                progress(step * len(images) + done + 1, len(PASSES) * len(images))
+        lines = _joined(found, used, skipped)
+        up, weight = _up(lines, most)
+        camera = camera_with_up(camera, up)
+    kept = weight > 0
+    residual = lines.normal[kept] @ up
+    return Tilt(
+        roll=camera.roll,
+        pitch=camera.pitch,
+        covariance=_covariance(lines, up, weight),
+        lines=int(kept.sum()),
+        candidates=len(weight),
+        images=used,
+        scatter=float(1.4826 * np.median(np.abs(residual))),
+        per_image=_per_image(lines, weight, camera, names),
+        skipped=skipped,
+    )
+
+
+def camera_with_tilt(camera, found):
+    """The camera with the roll and pitch of a `Tilt`."""
+    return replace(camera, roll=found.roll, pitch=found.pitch)
+
+
+def describe(found):
+    """Two lines for whoever turns the screws of the mount."""
+    errors = np.sqrt(np.diag(found.covariance))
+    rows = (
+        ("pitch", found.pitch, errors[1], "raise the front" if found.pitch > 0 else "lower the front"),
+        ("roll", found.roll, errors[0], "lower the left" if found.roll > 0 else "raise the left"),
+    )
+    return "\n".join(
+        f"{name} {degrees(angle):+.2f} +- {degrees(error):.2f} deg: {what} by "
+        f"{abs(degrees(angle)):.2f} deg"
+        for name, angle, error, what in rows
+    )
+
+
+def camera_with_up(camera, up):
+    """The camera turned so that what it takes for the direction `up` [3] points up; yaw is kept."""
+    x, y, z = tilt_matrix(camera.roll, camera.pitch).T @ (up / np.linalg.norm(up))
+    return replace(camera, roll=float(np.arctan2(y, z)), pitch=float(-np.arcsin(x)))
+
+
+def _normals(image, camera, slope, index):
+    """`Normals` of one image's nearly vertical lines."""
+    view = panorama(camera)
+    spacing = (view.elevation[0] - view.elevation[-1]) / (len(view.elevation) - 1)
+    length, gap = (max(2, round(angle / spacing)) for angle in (LENGTH, GAP))
+    edges = find_edges(
+        unwrap(image, view), view.valid, CONTRAST, SIGNIFICANCE, length, gap, slope
+    )
+    n = int(edges.segment.max(initial=-1)) + 1
+    ray = directions(view.bearing(edges.column - PAD), view.elevation[edges.row])
+    moment = np.stack(
+        [np.bincount(edges.segment, a * b, n) for a in ray.T for b in ray.T], -1
+    ).reshape(n, 3, 3)
+    value, vector = np.linalg.eigh(moment)
+    count = np.bincount(edges.segment, minlength=n)
+    # A normal turns about the line's middle by its points' scatter, of rows in blocks, over their
+    # lever.
+    variance = BLOCK * value[:, 0] / np.maximum(count, 1) + (FLOOR * view.step) ** 2
+    sigma = np.sqrt(variance / np.maximum(value[:, 1], 1e-12))
+    middle = np.bincount(edges.segment, edges.column, n) / count
+    once = (middle >= PAD - 0.5) & (middle < PAD + len(view.azimuth) - 0.5)
+    return Normals(vector[once, :, 0], sigma[once], np.full(int(once.sum()), index))
+
+
+def _joined(found, used, skipped):
+    lines = Normals(*(np.concatenate(part) for part in zip(*found, strict=True))) if found else None
+    if lines is None or len(lines.sigma) < LEAST_LINES:
+        count = 0 if lines is None else len(lines.sigma)
+        reasons = "; ".join(f"{count} skipped: {reason}" for reason, count in skipped.items())
+        raise ValueError(
+            f"tilt: {count} nearly vertical lines in {used} images; at least {LEAST_LINES} are "
+            f"needed{'; ' if reasons else ''}{reasons}"
+        )
+    return lines
+
+
+def _up(lines, most):
+    """Up [3] (z = 1) within `most` [rad] of z, and the lines' weights [n]: 0 for what leans."""
+    trial = np.linspace(-most, most, GRID)
+    x, y = (part.ravel() for part in np.meshgrid(trial, trial))
+    spread = np.hypot(lines.sigma, SPREAD)
+    away = np.abs(lines.normal @ np.stack([x, y, np.ones_like(x)])) / spread[:, None]
+    best = np.argmin(np.minimum(away**2, 9.0).sum(axis=0))
+    up = np.array([x[best], y[best], 1.0])
+    for _ in range(20):
+        residual = lines.normal @ up
+        robust = np.maximum(1.4826 * np.median(np.abs(residual)), 1e-4)
+        scale = BIWEIGHT * np.hypot(lines.sigma, min(robust, SPREAD))
+        weight = np.clip(1 - (residual / scale) ** 2, 0, None) ** 2 / scale**2
+        normal = lines.normal * np.sqrt(weight)[:, None]
+        if np.linalg.matrix_rank(normal[:, :2], tol=1e-3 * np.linalg.norm(normal)) < 2:
+            raise ValueError("tilt: the vertical lines are all in one direction; turn the robot")
+        up[:2] = np.linalg.lstsq(normal[:, :2], -normal[:, 2], rcond=None)[0]
+    return up, weight
+
+
+def _covariance(lines, up, weight):
+    """Covariance [2, 2] of (roll, pitch), from how the lines scatter (sandwich)."""
+    # d roll = -d(up_y), d pitch = d(up_x) near level, so (roll, pitch) has rows (n_y, n_x).
+    design = lines.normal[:, [1, 0]] * [1.0, -1.0]
+    bread = np.linalg.inv((design * weight[:, None]).T @ design)
+    score = design * (weight * (lines.normal @ up))[:, None]
+    return bread @ (score.T @ score) @ bread
+
+
+def _per_image(lines, weight, camera, names):
+    """(name, roll, pitch, lines) of the images with enough lines of their own."""
+    rows = []
+    for index, name in enumerate(names):
+        mine = (lines.image == index) & (weight > 0)
+        if mine.sum() < LEAST_PER_IMAGE:
+            continue
+        normal = lines.normal[mine] * np.sqrt(weight[mine])[:, None]
+        xy = np.linalg.lstsq(normal[:, :2], -normal[:, 2], rcond=None)[0]
+        one = camera_with_up(camera, np.array([*xy, 1.0]))
+        rows.append((name, one.roll, one.pitch, int(mine.sum())))
+    return rows
