@@ -4,7 +4,7 @@ A driver who watches the robot steers it round the room; the log knows only the 
 wheels slip: the truth falls short of them. Metres, radians (CCW).
 """
 
-from math import atan2, ceil, cos, hypot, inf, pi, sin
+from math import atan2, ceil, cos, hypot, pi, sin
 from typing import NamedTuple
 
 import numpy as np
@@ -22,13 +22,13 @@ LENGTH = {"loop": 60.0, "straight": 6.0, "turn": 2 * pi}  # m, m, rad
 
 
 class Drive(NamedTuple):
-    """True poses [n + 1, 3] at the stops and the commands [n, 2] between them: distance, then turn."""
+    """True poses [n + 1, 3] at the stops, and the commands [n, 2] between: distance, then turn."""
 
     pose: np.ndarray
     command: np.ndarray
 
 
-def drive(
+def stop_and_go(
     kind="loop",  # loop: round and round; straight: along a wall; turn: on the spot
     seed=0,
     *,
@@ -38,7 +38,7 @@ def drive(
     turn_error=0.02,  # standard deviation of a turn's relative error
     drift=0.01,  # rad/sqrt m, by which the heading strays when driving
 ):
-    """A `Drive` through any `room`: furniture keeps off its path. Raises `ValueError`."""
+    """A `Drive` through any furnished room: furniture keeps off its path. Raises `ValueError`."""
     _check(kind, step, length, slip, turn_error, drift)
     length = LENGTH[kind] if length is None else length
     rng = np.random.default_rng([seed, 1])
@@ -119,14 +119,11 @@ def _loop(rng, length):
 def _check(kind, step, length, slip, turn_error, drift):
     if kind not in LENGTH:
         raise ValueError(f"drive: {kind!r} is none of {', '.join(LENGTH)}")
-    longest = {"loop": inf, "straight": LANE - 0.5, "turn": inf}[kind]
+    longest = LANE - 0.5 if kind == "straight" else 10_000
+    good = length is None or 0 < length <= longest
     rules = {
         "step": (step, 0.02 <= step <= 0.5, "0.02 to 0.5 m"),
-        "length": (
-            length,
-            length is None or 0 < length <= longest < inf or 0 < length < longest,
-            f"above 0, to {longest:g}",
-        ),
+        "length": (length, good, f"above 0, to {longest:g}"),
         "slip": (slip, 0 <= slip <= 0.2, "0 to 0.2"),
         "turn_error": (turn_error, 0 <= turn_error <= 0.2, "0 to 0.2"),
         "drift": (drift, 0 <= drift <= 0.1, "0 to 0.1 rad/sqrt m"),

@@ -1,24 +1,31 @@
-"""What an omnidirectional camera sees in a furnished room: ray casting, then a camera's flaws.
+"""A rendered room: images of a mirror camera that is driven round it, and the exact truth.
 
-Every pixel is the mean of some rays, spread over it. The rays are sorted by azimuth once for a
-camera. The azimuths of all faces' ends cut the view into sectors; within one, the same faces lie
-behind each other in the same order, so that a sector is painted from back to front, exactly.
-Images are uint8 [H, W, 3], blue, green, red; colours before that are a video signal of 0..1.
+The room is drawn (`furnish`), driven (`drive`), seen (`raycast`); here a camera's flaws are added
+and all is written into a folder, as a real drive would leave it. Images are uint8 [H, W, 3], blue,
+green, red; before that, colours are a video signal of 0..1.
 """
 
-from math import pi
+import errno
+import json
+import math
+import os
+import shutil
+from pathlib import Path
+from secrets import token_hex
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from jaxslam.room import DEPTH, HEIGHT, VIEW, WIDTH, World, outside
-from jaxslam.render_texture import FLAT_TEXEL, TEXEL
+from jaxslam.drive import stop_and_go
+from jaxslam.furnish import furnish
+from jaxslam.raycast import camera_rays, expose, scene
+from jaxslam.room import VIEW, eye_at, visible_edges
 from jaxslam.vision.camera import Camera
+from jaxslam.vision.camera_files import save_camera
 
-RIM = np.radians(1.0)  # what is imaged beyond the usable elevations, so that a tilt leaves them
-SOFT = np.radians(0.3)  # over which the image darkens there
-DARK = 0.025  # outside, and on the mirror's holder in the middle
+SECONDS = 1.0  # s from stop to stop
+PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]  # noise does not get smaller by trying harder
 
 
 class Effects(NamedTuple):
@@ -35,6 +42,7 @@ class Effects(NamedTuple):
     interlace: float = 0.0  # px, by which a shake moves the odd rows' field
 
 
+MOST = Effects(2.0, 0.5, 0.3, 0.3, 0.3, 0.3, 10.0, 20.0, 5.0)._asdict()
 PRESETS = {
     "clean": Effects(
         brightness=0, colour=0, shading=0, noise=0, dark_noise=0, blur=0, chroma_blur=0
@@ -55,13 +63,13 @@ def double_mirror_camera(misalignment=1.0):
         raise ValueError(f"double_mirror_camera: misalignment is {misalignment!r}, allowed: 0 to 2")
     m = misalignment
     rho = np.linspace(0.01, 0.76, 200)
-    zenith = (25 + (rho * 320 - 60) * 70 / 172) * pi / 180  # 60 px at 65 degrees, 232 px at -5
+    zenith = (25 + (rho * 320 - 60) * 70 / 172) * math.pi / 180  # 60 px at 65 degrees, 232 px at -5
     powers = rho[:, None] ** np.array([0, 2, 3, 4])
     shape = np.linalg.lstsq(powers * np.sin(zenith)[:, None], rho * np.cos(zenith), rcond=None)[0]
     centre, affine = (319.5 + 3.2 * m, 239.5 - 1.9 * m), (1 + 0.0030 * m, 0.0008 * m, 0.0008 * m)
     params = (*centre, *affine, 0.0012 * m, -0.0016 * m, *shape)
     tilt = {"roll": np.radians(0.6) * m, "pitch": np.radians(-0.45) * m}
-    place = {"yaw": pi / 2, "position": (0.0, 0.0, 0.6), "elevation": VIEW}
+    place = {"yaw": math.pi / 2, "position": (0.0, 0.0, 0.6), "elevation": VIEW}
     return Camera(640, 480, "polynomial", np.array(params), **place, **tilt)
 
 
@@ -73,162 +81,7 @@ def nominal(camera):
     return Camera(camera.width, camera.height, camera.model, params, **same)
 
 
-class Rays(NamedTuple):
-    """A camera's rays by azimuth [n] (robot frame): direction over ground [n, 2], `slope` [n], and
-    `place` [n] of each in [pixels, samples]; `pixel` [P] flat indices into the image, with their
-    `side` [P] azimuth and `share` [P] of the scene; `dark` float32 [H, W, 3], what is around it."""
-
-    azimuth: np.ndarray
-    cosine: np.ndarray
-    sine: np.ndarray
-    slope: np.ndarray
-    place: np.ndarray
-    pixel: np.ndarray
-    side: np.ndarray
-    share: np.ndarray
-    dark: np.ndarray
-
-
-def camera_rays(camera, samples=5):
-    """`Rays` of a camera, so many to a pixel."""
-    v, u = np.mgrid[: camera.height, : camera.width]
-    pixel = np.stack([u, v], -1).reshape(-1, 2).astype(float)
-    up = 1 if (camera.lens == "up") != camera.mirror else -1
-    elevation = np.arcsin(up * camera.ray(pixel)[:, 2])  # from the lens' own plane: the rim's
-    low, high = camera.elevation[0] - RIM, camera.elevation[1] + RIM
-    share = np.clip(0.5 + np.minimum(elevation - low, high - elevation) / SOFT, 0, 1)
-    ring = 0.05 * np.exp(-(((elevation - high) / np.radians(4) - 1.2) ** 2) * 4)
-    dark = np.repeat(DARK + ring[:, None], 3, 1)
-    kept = np.flatnonzero(share > 0)
-    # a sequence of low discrepancy, shifted pixel by pixel: no row or column is preferred
-    plastic = np.array([0.7548776662, 0.5698402910])
-    shift = np.random.default_rng(0).random((len(kept), 1, 2))
-    spread = (shift + np.arange(samples)[:, None] * plastic) % 1 - 0.5
-    direction = camera.direction((pixel[kept, None] + spread).reshape(-1, 2))
-    azimuth = np.arctan2(direction[:, 1], direction[:, 0])
-    place = np.argsort(azimuth, kind="stable")
-    ground = np.hypot(direction[:, 0], direction[:, 1])
-    parts = (direction[:, 0] / ground, direction[:, 1] / ground, direction[:, 2] / ground)
-    cosine, sine, slope = (part[place].astype(np.float32) for part in parts)
-    middle = camera.direction(pixel[kept])
-    side = np.arctan2(middle[:, 1], middle[:, 0])
-    dark = dark.reshape(camera.height, camera.width, 3).astype(np.float32)
-    share = share[kept, None].astype(np.float32)
-    return Rays(azimuth[place], cosine, sine, slope, place, kept, side, share, dark)
-
-
-class Scene(NamedTuple):
-    """A world with all its colours in one table, [n] of 4 bytes: where each face's, the floor's,
-    the ceiling's and the boxes' tops' begin, and each face's rows."""
-
-    world: World
-    colours: np.ndarray
-    face: np.ndarray
-    rows: np.ndarray
-    floor: int
-    ceiling: int
-    tops: int
-
-
-def scene(world):
-    tops = np.array([box.colour for box in world.boxes])[:, None]
-    paints = [*(face.texture for face in world.faces), world.floor, world.ceiling, tops]
-    begin = np.cumsum([0] + [paint.shape[0] * paint.shape[1] for paint in paints]).tolist()
-    colours = np.zeros((begin[-1], 4), np.uint8)
-    colours[:, :3] = np.concatenate([paint.reshape(-1, 3) for paint in paints])
-    rows = np.array([paint.shape[1] for paint in paints])
-    return Scene(world, colours.view(np.uint32)[:, 0], np.array(begin[:-4]), rows, *begin[-4:-1])
-
-
-def cast(scene, rays, eye, heading):
-    """Colours uint8 [n, 4] (the last is void) that the rays meet from `eye` [3]."""
-    index = np.zeros(len(rays.azimuth), np.int32)
-    c, s = np.float32(np.cos(heading)), np.float32(np.sin(heading))
-    dx, dy = c * rays.cosine - s * rays.sine, s * rays.cosine + c * rays.sine
-    for begin, end, faces in _sectors(scene.world, rays.azimuth, eye, heading):
-        part = slice(begin, end)
-        for i, face in enumerate(faces):
-            paint = _paint_wall if i == 0 else _paint_box
-            paint(scene, face, eye, dx[part], dy[part], rays.slope[part], index[part])
-    return scene.colours[index].view(np.uint8).reshape(-1, 4)
-
-
-def _sectors(world, azimuth, eye, heading):
-    """(begin, end, faces from back to front) of the pieces of the sorted azimuths [n]."""
-    to_start, to_end = world.start - eye[:2], world.end - eye[:2]
-    facing = to_start[:, 0] * to_end[:, 1] - to_start[:, 1] * to_end[:, 0] > 0
-    face = np.flatnonzero(facing)
-    first, last = (
-        (np.arctan2(to[face, 1], to[face, 0]) - heading + pi) % (2 * pi) - pi
-        for to in (to_start, to_end)
-    )
-    border = np.unique(np.concatenate([first, last, [-pi, pi]]))
-    middle = (border[1:] + border[:-1])[:, None] / 2
-    covers = (middle - first) % (2 * pi) < (last - first) % (2 * pi)
-    normal = _unit_normals(world)[face]
-    depth = np.sum(to_start[face] * normal, -1)
-    turned = middle + heading
-    with np.errstate(divide="ignore"):
-        reach = depth / (np.cos(turned) * normal[:, 0] + np.sin(turned) * normal[:, 1])
-    order = np.argsort(np.where(covers, -reach, np.inf), axis=1)
-    bounds = np.searchsorted(azimuth, border)
-    bounds[-1] = len(azimuth)
-    for k, count in enumerate(covers.sum(1)):
-        if bounds[k + 1] > bounds[k]:
-            yield bounds[k], bounds[k + 1], face[order[k, :count]]
-
-
-def _unit_normals(world):
-    span = world.end - world.start
-    return np.stack([-span[:, 1], span[:, 0]], -1) / np.linalg.norm(span, axis=-1)[:, None]
-
-
-def _meet(scene, face, eye, dx, dy, slope):
-    """Where rays meet a face's plane: distance over ground, height, index into the colours."""
-    start = scene.world.start[face] - eye[:2]
-    span = scene.world.end[face] - scene.world.start[face]
-    ex, ey = (span / np.hypot(*span)).tolist()
-    sx, sy = start.tolist()
-    reach = np.float32(sx * ey - sy * ex) / (dx * np.float32(ey) - dy * np.float32(ex))
-    column = reach * (dx * np.float32(ex / TEXEL) + dy * np.float32(ey / TEXEL))
-    column -= np.float32((sx * ex + sy * ey) / TEXEL)
-    rows, columns = scene.rows[face], round(np.hypot(*span) / TEXEL)
-    height = reach * slope + np.float32(eye[2])
-    index = np.clip(column.astype(np.int32), 0, columns - 1) * np.int32(rows)
-    return height, index + (height * np.float32(1 / TEXEL)).astype(np.int32)
-
-
-def _paint_wall(scene, face, eye, dx, dy, slope, index):
-    """A wall, with the floor below it and the ceiling above."""
-    height, found = _meet(scene, face, eye, dx, dy, slope)
-    index[:] = found + np.int32(scene.face[face])
-    for level, begin, at in (
-        (0.0, scene.floor, np.flatnonzero(height < 0)),
-        (HEIGHT, scene.ceiling, np.flatnonzero(height >= HEIGHT)),
-    ):
-        if len(at):
-            reach = np.float32((level - eye[2]) / FLAT_TEXEL) / slope[at]
-            x = (reach * dx[at] + np.float32(eye[0] / FLAT_TEXEL)).astype(np.int32)
-            y = (reach * dy[at] + np.float32(eye[1] / FLAT_TEXEL)).astype(np.int32)
-            columns, rows = round(WIDTH / FLAT_TEXEL), round(DEPTH / FLAT_TEXEL)
-            x, y = np.clip(x, 0, columns - 1), np.clip(y, 0, rows - 1)
-            index[at] = begin + x * rows + y
-
-
-def _paint_box(scene, face, eye, dx, dy, slope, index):
-    """A box's face, and its top where it is seen from above."""
-    world = scene.world
-    top, owner = world.top[face], world.owner[face]
-    if top < eye[2]:
-        at = np.flatnonzero(slope < 0)
-        reach = np.float32(top - eye[2]) / slope[at]
-        point = np.stack([eye[0] + reach * dx[at], eye[1] + reach * dy[at]], -1)
-        index[at[outside(world.boxes[owner], point).max(-1) < 0]] = scene.tops + owner
-    height, found = _meet(scene, face, eye, dx, dy, slope)
-    np.copyto(index, found + np.int32(scene.face[face]), where=(height >= 0) & (height < top))
-
-
-def frames(world, camera, drive, effects=PRESETS["normal"], seed=0, samples=5):
+def frames(world, camera, drive, effects=PRESETS["normal"], seed=0, samples=8):
     """Yield (image, true pose, command that led there) for every stop of a `Drive`.
 
     The first has no command: None. An image depends on the seed, its number and its pose alone.
@@ -240,41 +93,22 @@ def frames(world, camera, drive, effects=PRESETS["normal"], seed=0, samples=5):
         yield _shoot(built, rays, camera, pose, effects, light, k), pose, command
 
 
-def picture(world, camera, pose, samples=5):
-    """Image float32 [H, W, 3] in 0..1 of the room from a pose, without any effect."""
-    return _expose(scene(world), camera_rays(camera, samples), camera, pose)
-
-
-def _expose(scene, rays, camera, pose, light=1.0):
-    """Image [H, W, 3] with `light` [P, 3] (or 1) on each pixel."""
-    x, y, heading = pose
-    c, s = np.cos(heading), np.sin(heading)
-    px, py, height = camera.position
-    eye = np.array([x + c * px - s * py, y + s * px + c * py, height])
-    colours = np.empty((len(rays.place), 4), np.uint8)
-    colours[rays.place] = cast(scene, rays, eye, heading)
-    colours = colours.reshape(len(rays.pixel), -1, 4)
-    mean = colours.sum(axis=1, dtype=np.uint16)[:, :3] * np.float32(1 / 255 / colours.shape[1])
-    image = rays.dark.copy()
-    flat = image.reshape(-1, 3)
-    flat[rays.pixel] += rays.share * (mean * light - flat[rays.pixel])
-    return image
-
-
 class _Light:
     """How the light changes: slowly, as sums of waves, and a little anew each frame."""
 
     def __init__(self, seed):
         rng = np.random.default_rng([seed, 2])
         self.seed = seed
-        self.rate = 2 * pi / rng.uniform(15, 150, (4, 5))  # rad a frame; brightness, three colours
-        self.phase = rng.uniform(-pi, pi, (4, 5))
+        # rad a frame, of the brightness and of three colours
+        self.rate = 2 * math.pi / rng.uniform(15, 150, (4, 5))
+        self.phase = rng.uniform(-math.pi, math.pi, (4, 5))
 
     def at(self, k, effects, azimuth, rng):
         """Light [P, 3] in frame `k` on pixels at these azimuths [P] of the world."""
         slow = np.sqrt(2 / 5) * np.sin(self.rate * k + self.phase).sum(-1)
         wave = 0.9 * slow + 0.43 * rng.standard_normal(4)  # unit variance
-        side = 1 + effects.shading * rng.standard_normal() * np.cos(azimuth - rng.uniform(-pi, pi))
+        turned = np.cos(azimuth - rng.uniform(-math.pi, math.pi))
+        side = 1 + effects.shading * rng.standard_normal() * turned
         gain = np.exp(effects.brightness * wave[0] + effects.colour * wave[1:]) * effects.exposure
         return side[:, None].astype(np.float32) * gain.astype(np.float32)
 
@@ -282,19 +116,165 @@ class _Light:
 def _shoot(scene, rays, camera, pose, effects, light, k):
     rng = np.random.default_rng([light.seed, 3, k])
     on = light.at(k, effects, rays.side + pose[2], rng)
-    image = _expose(scene, rays, camera, pose, on)
+    image = expose(scene, rays, eye_at(pose, camera.position), pose[2], on)
     if effects.blur:
         image = cv2.GaussianBlur(image, (0, 0), effects.blur)
     if effects.interlace:
         dx, dy = effects.interlace * rng.standard_normal(2)
         shaken = cv2.warpAffine(image, np.float32([[1, 0, dx], [0, 1, dy]]), image.shape[1::-1])
         image[1::2] = shaken[1::2]
+    if effects.noise or effects.dark_noise:
+        spread = np.sqrt(effects.dark_noise**2 + effects.noise**2 * np.maximum(image, 0))
+        image += spread * rng.standard_normal(image.shape, np.float32)
     if effects.chroma_blur:
         parts = cv2.cvtColor(image, cv2.COLOR_BGR2YCrCb)
         colour = parts[..., 1:].copy()
         parts[..., 1:] = cv2.GaussianBlur(colour, (0, 1), effects.chroma_blur, sigmaY=1e-6)
         image = cv2.cvtColor(parts, cv2.COLOR_YCrCb2BGR)
-    if effects.noise or effects.dark_noise:
-        spread = np.sqrt(effects.dark_noise**2 + effects.noise**2 * np.maximum(image, 0))
-        image += spread * rng.standard_normal(image.shape, np.float32)
     return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+
+
+def render_room(
+    out,
+    seed=0,  # draws the room, the drive, the light and the noise
+    *,
+    drive="loop",  # loop: rounds; straight: along a wall; turn: on the spot
+    step=0.2,  # m from image to image
+    length=None,  # m at least; None: 60 round and round, 6 straight; rad of a turn: a whole one
+    preset="normal",  # clean, normal or hard
+    effects=None,  # `Effects`, instead of the preset's
+    slip=0.025,  # mean share of every distance that wheels lose
+    turn_error=0.02,  # standard deviation of a turn's relative error
+    drift=0.01,  # rad/sqrt m
+    shadows=1.0,  # 0 to 1: how dark it is where things meet
+    plain=0.2,  # 0 to 1: the share of the furniture that hardly differs from the wall
+    camera=None,  # None: `double_mirror_camera()`
+    overwrite=False,
+    progress=None,  # called with (images done, all)
+):
+    """Write a drive through a rendered room into the folder `out`; the number of images.
+
+    images/000000.png ... and frames.csv, odometry.csv (commands), camera.toml and
+    camera_nominal.toml (what one would assume without calibration); the truth: poses.csv,
+    landmarks.csv, plan.csv, edges.csv (all vertical edges, the lower ones too; `contrast` is the
+    mean over the images that saw it) and visible.csv (every edge's bearing in every image);
+    room.toml (the settings). All of it appears at once, or nothing does. Raises `ValueError`.
+    """
+    camera = double_mirror_camera() if camera is None else camera
+    effects = _effects(preset) if effects is None else effects
+    _check(seed, effects)
+    settings = {"seed": seed, "drive": drive, "step": step, "length": length, "preset": preset}
+    settings |= {"slip": slip, "turn_error": turn_error, "drift": drift}
+    settings |= {"shadows": shadows, "plain": plain}
+    driven = stop_and_go(
+        drive, seed, step=step, length=length, slip=slip, turn_error=turn_error, drift=drift
+    )
+    world = furnish(seed, shadows=shadows, plain=plain)
+    target = _target(out, overwrite)
+    partial = target.with_name(f".{target.name}.{token_hex(4)}")
+    try:
+        (partial / "images").mkdir(parents=True)
+        _write(partial, world, driven, camera, effects, seed, progress)
+        lines = [f"{name} = {json.dumps(v)}" for name, v in settings.items() if v is not None]
+        lines += ["", "[effects]", *(f"{k} = {v!r}" for k, v in effects._asdict().items())]
+        _text(partial / "room.toml", lines)
+        _move(partial, target)
+    except OSError as error:
+        if error.errno == errno.ENOSPC:
+            raise
+        raise ValueError(f"{out}: can't be written ({error.strerror}); choose another") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return len(driven.pose)
+
+
+def _write(folder, world, driven, camera, effects, seed, progress):
+    """All but the settings; one image at a time is in memory."""
+    count = len(driven.pose)
+    seen, contrast = np.zeros(len(world.edges.kind)), np.zeros(len(world.edges.kind))
+    with open(folder / "visible.csv", "w", encoding="utf-8", newline="\n") as file:
+        file.write("image,id,bearing_rad,distance_m,low_rad,high_rad,contrast\n")
+        for k, (image, pose, _) in enumerate(frames(world, camera, driven, effects, seed)):
+            name = f"{k:06d}.png"
+            if not cv2.imwrite(str(folder / "images" / name), image, PNG):
+                raise OSError(0, f"images/{name} can't be written")
+            view = visible_edges(world, pose, camera.position, camera.elevation)
+            np.add.at(seen, view.id, 1)
+            np.add.at(contrast, view.id, view.contrast)
+            for row in zip(view.id, *view[1:6], strict=True):
+                file.write(f"{name},{row[0]}," + ",".join(f"{v:.6f}" for v in row[1:]) + "\n")
+            if progress:
+                progress(k + 1, count)
+    save_camera(folder / "camera.toml", camera)
+    save_camera(folder / "camera_nominal.toml", nominal(camera))
+    _truth(folder, world, driven, contrast / np.maximum(seen, 1))
+
+
+def _truth(folder, world, driven, contrast):
+    time = np.arange(len(driven.pose)) * SECONDS
+    edges, tall = world.edges, np.flatnonzero(world.edges.landmark)
+    bounds = (edges.bottom, edges.top, contrast)
+    tables = {
+        "frames.csv": ("image,time_s", [f"{k:06d}.png" for k in range(len(time))], time),
+        "odometry.csv": ("time_s,distance_m,turn_rad", time[1:], *driven.command.T),
+        "poses.csv": ("time_s,x_m,y_m,theta_rad", time, *driven.pose.T),
+        "landmarks.csv": ("id,x_m,y_m", tall, *edges.point[tall].T),
+        "plan.csv": ("x1_m,y1_m,x2_m,y2_m", *world.plan.T),
+        "edges.csv": (
+            "id,x_m,y_m,bottom_m,top_m,contrast,kind",
+            *(np.arange(len(contrast)), *edges.point.T, *bounds, edges.kind),
+        ),
+    }
+    for name, (header, *columns) in tables.items():
+        rows = zip(*columns, strict=True)
+        _text(folder / name, [header, *(",".join(_cell(v) for v in row) for row in rows)])
+
+
+def _cell(value):
+    return f"{value:.6f}" if isinstance(value, float) else str(value)
+
+
+def _text(path, lines):
+    path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8", newline="\n")
+
+
+def _target(out, overwrite):
+    """The folder to be made; only a rendered room is overwritten."""
+    target = Path(out).resolve()
+    if os.path.lexists(target):
+        if not overwrite:
+            raise ValueError(f"{out}: exists; choose another folder or add --overwrite")
+        if not (target / "room.toml").is_file():
+            raise ValueError(f"{out}: is not a rendered room, so it is not overwritten")
+    return target
+
+
+def _move(partial, target):
+    old = None
+    if target.exists():
+        old = target.with_name(f".{target.name}.{token_hex(4)}")
+        os.rename(target, old)
+    try:
+        os.rename(partial, target)
+    except BaseException:
+        if old:
+            os.rename(old, target)
+        raise
+    if old:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _effects(preset):
+    if preset not in PRESETS:
+        raise ValueError(f"render: preset {preset!r} is none of {', '.join(PRESETS)}")
+    return PRESETS[preset]
+
+
+def _check(seed, effects):
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ValueError(f"render: seed is {seed!r}, allowed: a whole number, 0 or more")
+    for name, value in effects._asdict().items():
+        if not 0 <= value <= MOST[name]:
+            raise ValueError(f"render: {name} is {value!r}, allowed: 0 to {MOST[name]:g}")
+    if not effects.exposure:
+        raise ValueError("render: exposure is 0, allowed: above 0")

@@ -12,7 +12,7 @@ TEXEL = 0.005  # m, vertical surfaces
 FLAT_TEXEL = 0.01  # m, floor and ceiling
 TILE = 0.30  # m, the floor's tiles as in the paper's room
 PANEL = 0.60  # m, the ceiling's panels
-AMBIENT, LAMP = 0.80, 2.2  # light from everywhere, and of one lamp at 1 m face to face
+AMBIENT, LAMP = 0.76, 2.0  # light from everywhere, and of one lamp at 1 m face to face
 SHINING = 1.0  # added to what shines by itself: paint is below it, and takes the room's light
 FRAME = 0.06  # m, the width of door and window frames
 
@@ -138,19 +138,17 @@ def drawers(rng, texture, colour):
 def shelf(rng, texture, colour):
     """Boards with files and books; returns where the vertical edges of those are."""
     wide, high = np.array(texture.shape[:2]) * TEXEL
-    side, edges = 0.03, []
+    edges = []
     texture[:] = np.multiply(colour, 0.35)
     for bottom in np.arange(0.08, high - 0.3, 0.36):
-        left = side + round(rng.uniform(0, 0.05), 2)
-        while (width := round(rng.uniform(0.10, 0.26), 2)) < wide - side - left:
+        left = round(rng.uniform(0, 0.05), 2)
+        while (width := round(rng.uniform(0.10, 0.26), 2)) < wide - left:
             top = bottom + round(rng.uniform(0.24, 0.32), 2)
             back = BRIGHT[rng.integers(4)] if rng.random() < 0.5 else METAL[rng.integers(4)]
             paint(texture, left, left + width, bottom, top, np.multiply(back, rng.uniform(0.8, 1)))
             edges += [(round(s, 2), bottom, top) for s in (left, left + width)]
             left += width + (0.08 if rng.random() < 0.15 else 0.0)
         paint(texture, 0, wide, bottom - 0.03, bottom, colour)
-    for a, b in ((0, side), (wide - side, wide)):
-        grain(rng, paint(texture, a, b, 0, high, colour), 0.03)
     return edges
 
 
