@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 PAD = 16  # columns repeated beyond the seam: more than any filter here reaches
-SMOOTH_ROWS = 7  # noise is averaged along the edge before it is judged
+SMOOTH_ROWS = 9  # noise is averaged along the edge before it is judged
 NOISE_STRIDE = 4  # every so many columns tell a row's noise
 
 
