@@ -13,7 +13,7 @@ import numpy as np
 from jaxslam.render_texture import FLAT_TEXEL, TEXEL
 from jaxslam.room import DEPTH, HEIGHT, WIDTH, World, outside
 
-RIM = np.radians(1.0)  # what is imaged beyond the usable elevations, so that a tilt leaves them
+RIM = np.radians(1.3)  # what is imaged beyond the usable elevations, so that a tilt leaves them
 SOFT = np.radians(0.3)  # over which the image darkens there
 DARK = 0.025  # outside, and on the mirror's holder in the middle
 
