@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam import render_texture as texture
-from jaxslam.room import DEPTH, HEIGHT, WIDTH, Box, Edges, Face, World, left, outside
+from jaxslam.room import DEPTH, HEIGHT, LANDMARK, WIDTH, Box, Edges, Face, World, left, outside
 
 LAMPS = ((2.0, 2.0), (5.0, 2.0), (8.0, 2.0))  # m, their middles on the ceiling
 LAMP = (1.2, 0.3)  # m
@@ -143,7 +143,7 @@ def _stand(rng, colours, built, kind, corner, axis, width, free=False):
         texture.plaster(rng, face.texture)
         if side % 2 and kind in texture.FRONTS:
             marks = texture.FRONTS[kind](rng, face.texture, colour)
-            built.edges.extend(_marked(face, marks, "book" if kind == "shelf" else kind))
+            built.edges.extend(_marked(face, marks, kind))
         built.faces.append(face)
         built.owner.append(len(built.boxes))
     built.boxes.append(Box(corner, axis, width, deep, tall, colour))
@@ -166,14 +166,17 @@ def _hang(rng, colours, paint, kind, begin, width):
 
 
 def _marked(face, marks, kind):
-    """Edges (x, y, bottom, top, kind) of marks (along, bottom, top) on a face."""
-    return [(*(face.start + s * _direction(face)), low, high, kind) for s, low, high in marks]
+    """Edges (x, y, bottom, top, kind) of marks (along, bottom, top) on a face; the low ones (books,
+    handles) are details."""
+    at = face.start + np.array([s for s, _, _ in marks])[:, None] * _direction(face)
+    kinds = [kind if high - low >= LANDMARK else "detail" for _, low, high in marks]
+    return [(*p, *mark[1:], name) for p, mark, name in zip(at, marks, kinds, strict=True)]
 
 
 def _merge(edges):
     """`Edges` of rows (x, y, bottom, top, kind); those of one place that touch become one."""
     rows = []
-    for x, y, low, high, kind in sorted(edges, key=lambda row: (row[4] == "book", row[2])):
+    for x, y, low, high, kind in sorted(edges, key=lambda row: (row[4] == "detail", row[2])):
         for row in rows:
             if np.hypot(row[0] - x, row[1] - y) < SAME and low <= row[3] and high >= row[2]:
                 row[2:4] = min(row[2], low), max(row[3], high)

@@ -71,7 +71,8 @@ def door(rng, texture, left, width, height, colours):
     grain(rng, wing)
     knob = right - FRAME - 0.1
     paint(texture, knob, knob + 0.05, 1.0, 1.16, (0.6, 0.62, 0.62))
-    return [(s, 0.0, height) for s in (left, left + FRAME, right - FRAME, right)]
+    handle = [(s, 1.0, 1.16) for s in (knob, knob + 0.05)]
+    return [(s, 0.0, height) for s in (left, left + FRAME, right - FRAME, right)] + handle
 
 
 def window(rng, texture, left, width, bottom, top, frame):
@@ -119,9 +120,11 @@ def cupboard(rng, texture, colour):
     paint(texture, 0, wide, 0, 0.08, np.multiply(colour, 0.5))
     half = round(wide / 2, 2)
     texture[texels(half) :] *= 0.86
+    edges, low = [(half, 0.08, high)], round(high / 2, 2)
     for knob in (half - 0.08, half + 0.06):
-        paint(texture, knob, knob + 0.02, high * 0.5, high * 0.5 + 0.12, (0.3, 0.3, 0.3))
-    return [(half, 0.08, high)]
+        paint(texture, knob, knob + 0.02, low, low + 0.12, (0.3, 0.3, 0.3))
+        edges += [(s, low, low + 0.12) for s in (knob, knob + 0.02)]
+    return edges
 
 
 def drawers(rng, texture, colour):
