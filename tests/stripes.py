@@ -1,5 +1,7 @@
 """For tests: a mirror camera, and a world of stripes whose borders are vertical lines."""
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 
@@ -17,15 +19,25 @@ def mirror_camera(**changes):
     return Camera(640, 480, "polynomial", params, **{**usual, **changes})
 
 
+@lru_cache(maxsize=2)
+def rays(camera, samples):
+    """Pixels [P] (flat) that see something, and directions [P, samples, 3] spread over each."""
+    v, u = np.mgrid[: camera.height, : camera.width].astype(float)
+    pixel = np.stack([u, v], -1).reshape(-1, 2)
+    up = np.arcsin(camera.direction(pixel)[:, 2])
+    low, high = camera.elevation
+    seen = np.flatnonzero((up > low - 0.05) & (up < high + 0.05))
+    k = np.arange(samples)[:, None]
+    spread = (k + 0.5) * np.array([1 / samples, 0.6180339887]) % 1 - 0.5
+    return seen, camera.direction(pixel[seen, None] + (spread if samples > 1 else 0.0))
+
+
 def painted(camera, colour, samples=1):
     """The image [H, W, 3] of a world whose colour is a function of direction [..., 3]."""
-    v, u = np.mgrid[: camera.height, : camera.width].astype(float)
-    shift = (np.arange(samples) + 0.5) / samples - 0.5
-    total = np.zeros((camera.height, camera.width, 3))
-    for dv in shift:
-        for du in shift:
-            total += np.nan_to_num(colour(camera.direction(np.stack([u + du, v + dv], -1))))
-    return total / samples**2
+    seen, direction = rays(camera, samples)
+    image = np.zeros((camera.height * camera.width, 3))
+    image[seen] = np.nan_to_num(colour(direction)).mean(1)
+    return image.reshape(camera.height, camera.width, 3)
 
 
 def photograph(picture, noise=0.0, blur=0.0, seed=0):
@@ -36,7 +48,7 @@ def photograph(picture, noise=0.0, blur=0.0, seed=0):
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
-def stripes(camera, azimuth, colour, low=-0.14, high=1.17, back=None, samples=4):
+def stripes(camera, azimuth, colour, low=-0.14, high=1.17, back=None, samples=10):
     """Picture of stripes: `colour[i]` from `azimuth[i]` (sorted, rad) to the next, wrapping round.
 
     Between elevations `low` and `high` [rad], scalars or one per stripe; elsewhere `back`.

@@ -15,6 +15,7 @@ REACH = 3  # columns on either side of an edge that its place is found from
 BLOCK = 6  # rows judged together
 PRIOR, USUAL = 3.0, 0.3  # as many blocks' worth of belief in this scatter [columns] of a block
 CLIP = 2.5  # standard deviations beyond which a block counts less
+FADED = 0.5  # of the mean gradient, where a line ends: averaging over rows reaches beyond it
 SOFT = 2.0  # pixels beside an edge where a sharp one's gradient has faded
 
 
@@ -53,15 +54,15 @@ def fit_segments(edges, columns_per_pixel):
     far = np.clip(np.rint(SOFT * columns_per_pixel), 2, PAD - 4).astype(int)[edges.row]
     beside = gradient(edges.along, centre[:, None] + far[:, None] * [-1, 1]).mean(1)
     across = gradient(edges.gradient, centre[:, None] + np.arange(-REACH, REACH + 1))
-    first, last = _ends(edges, n)
+    size = np.bincount(segment, np.abs(along), n)
+    first, last = _ends(edges, np.abs(along) >= FADED * mean(np.abs(along), segment, n)[segment], n)
     start, block = np.unique(
-        segment * len(edges.along) + (edges.row - first[segment]) // BLOCK,
+        segment * len(edges.along) + edges.row // BLOCK,
         return_index=True,
         return_inverse=True,
     )[1:]
     profile = np.stack([np.bincount(block, part) for part in across.T], -1)
     peak, scatter, width = _peak(profile, segment[start], n)
-    size = np.bincount(segment, np.abs(along), n)
     return Fit(
         column=centre[np.searchsorted(segment, np.arange(n))] + peak,
         scatter=scatter,
@@ -80,10 +81,11 @@ def mean(value, owner, n):
     return np.bincount(owner, value, n) / np.maximum(np.bincount(owner, minlength=n), 1)
 
 
-def _ends(edges, n):
-    """First and last row [n] of the segments: their rows are sorted."""
-    first = np.searchsorted(edges.segment, np.arange(n))
-    return edges.row[first], edges.row[np.append(first[1:], len(edges.row)) - 1]
+def _ends(edges, clear, n):
+    """First and last row [n] of the segments where `clear` [E]: rows are sorted in segments."""
+    segment, row, each = edges.segment[clear], edges.row[clear], np.arange(n)
+    first, beyond = (np.searchsorted(segment, each, side) for side in ("left", "right"))
+    return row[first], row[beyond - 1]
 
 
 def _slope(edges, n):

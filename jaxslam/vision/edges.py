@@ -75,12 +75,12 @@ def _peaks(magnitude, threshold):
 
 def _segments(peak, length, gap, slope):
     """Rows, columns and segment numbers of the peaks that form long upright runs."""
-    tall = np.ones((gap, 1), np.uint8)
+    tall = np.ones((gap | 1, 1), np.uint8)  # odd: an even one moves what it closes
     # A straight edge wanders by less than a column, so it fills a band of three; what leans
     # leaves its band before it is long, and is cut where it crosses another.
     band = cv2.dilate(peak, np.ones((1, 3), np.uint8))
     band = cv2.morphologyEx(band, cv2.MORPH_CLOSE, tall)
-    steep = max(3, min(length, int(2 / max(slope, 1e-3))))
+    steep = max(3, min(length, int(2 / slope))) | 1
     band = cv2.morphologyEx(band, cv2.MORPH_OPEN, np.ones((steep, 1), np.uint8))
     upright = peak & band
     joined = cv2.morphologyEx(upright, cv2.MORPH_CLOSE, tall)

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxslam.vision.edge_fit import fit_segments, mean
 from jaxslam.vision.edges import PAD, find_edges
+from jaxslam.vision.images import check_size
 from jaxslam.vision.line_pairs import merged, separated
 from jaxslam.vision.panorama import panorama, unwrap
 
@@ -86,34 +87,52 @@ def extract_lines(image, camera, settings=None):
     Raises `ValueError` when the image is not of the camera's size.
     """
     settings = settings or LineSettings()
-    if image.shape[:2] != (camera.height, camera.width):
-        found = f"{image.shape[1]} x {image.shape[0]}"
-        raise ValueError(
-            f"lines: image of {found} pixels, camera of {camera.width} x {camera.height}"
-        )
-    view = panorama(camera, settings.columns, settings.elevation)
-    return lines_of_panorama(unwrap(image, view), view, settings)
-
-
-def lines_of_panorama(picture, view, settings):
-    """`Lines` of a picture uint8 [H, W, 3] seen as the `Panorama` `view`."""
-    seen = picture if settings.colour else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)[..., None]
-    spacing = _row_height(view)
-    length, gap = (max(2, round(angle / spacing)) for angle in (settings.length, settings.gap))
-    level = max(float(np.mean(cv2.mean(seen, view.valid.view(np.uint8))[: seen.shape[2]])), 1.0)
-    edges = find_edges(
-        seen,
-        view.valid,
-        settings.contrast * level,
-        settings.significance,
-        length,
-        gap,
-        settings.slope,
-    )
+    view, picture = _panorama(image, camera, settings)
+    edges, level = _edges(picture, view, settings)
     lines = _lines(edges, picture, view, settings, level)
     if settings.merge:
         lines = merged(lines, settings.merge_bearing, settings.merge_gap)
     return lines.take(np.argsort(lines.bearing, kind="stable"))
+
+
+def halves(image, camera, settings=None):
+    """Bearings [n] rad of the upper and of the lower halves of the lines of twice the least length.
+
+    They differ where the camera's tilt or calibration is wrong.
+    """
+    settings = settings or LineSettings()
+    view, picture = _panorama(image, camera, settings)
+    edges, level = _edges(picture, view, settings)
+    wide = _columns_per_pixel(view)
+    fit = fit_segments(edges, wide)
+    keep = _upright(fit, view, settings, level)
+    keep &= (fit.last - fit.first) * _row_height(view) >= 2 * settings.length
+    lower = edges.row > ((fit.first + fit.last) / 2)[edges.segment]
+    segment = 2 * edges.segment + lower
+    parts = fit_segments(edges._replace(segment=segment), wide).column
+    upper, lower = view.bearing(parts.reshape(-1, 2)[keep] - PAD).T
+    return upper, lower
+
+
+def _panorama(image, camera, settings):
+    check_size(image, camera, "lines")
+    view = panorama(camera, settings.columns, settings.elevation)
+    return view, unwrap(image, view)
+
+
+def _edges(picture, view, settings):
+    """`Edges` of a panorama uint8 [H, W, 3], and its mean level, which contrast is relative to."""
+    seen = picture if settings.colour else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)[..., None]
+    levels = cv2.mean(seen, view.valid.view(np.uint8))
+    level = max(float(np.mean(levels[: seen.shape[2]])), 1.0)
+    length, gap = (
+        max(2, round(angle / _row_height(view))) for angle in (settings.length, settings.gap)
+    )
+    contrast = settings.contrast * level
+    edges = find_edges(
+        seen, view.valid, contrast, settings.significance, length, gap, settings.slope
+    )
+    return edges, level
 
 
 def is_dark(image, level=12.0):
@@ -124,11 +143,8 @@ def is_dark(image, level=12.0):
 def _lines(edges, picture, view, settings, level):
     """`Lines` of the segments that stand upright, each once (the seam's repeat left out)."""
     fit = fit_segments(edges, _columns_per_pixel(view))
-    keep = (np.abs(fit.slope) <= settings.slope) & (fit.strength >= settings.evidence * level)
-    keep &= (fit.column >= PAD - 0.5) & (fit.column < PAD + len(view.azimuth) - 0.5)
+    keep = _upright(fit, view, settings, level)
     usual = np.median(fit.width[keep]) if keep.any() else 1.0
-    if keep.any():  # what is softer than most edges is a shadow
-        keep &= fit.sharp >= settings.sharpness * np.median(fit.sharp[keep])
     index = np.flatnonzero(keep)
     blurred = np.clip(fit.width[index] ** 2 - (SOFTER * usual) ** 2, 0, None)
     scatter = np.sqrt(fit.scatter[index] ** 2 + RAMP**2 * blurred)
@@ -139,21 +155,32 @@ def _lines(edges, picture, view, settings, level):
         low=view.elevation[fit.last[index]] - half,
         high=view.elevation[fit.first[index]] + half,
         polarity=-fit.sign[index],
-        colour=_colours(edges, picture, fit.column)[index],
+        colour=_colours(edges, picture, fit)[index],
         strength=fit.strength[index] / level,
     )
     return separated(lines, usual * view.step)
 
 
-def _colours(edges, picture, column):
+def _upright(fit, view, settings, level):
+    """Mask [n] of the segments that are lines: upright, strong enough, sharp, in the panorama."""
+    keep = (np.abs(fit.slope) <= settings.slope) & (fit.strength >= settings.evidence * level)
+    keep &= (fit.column >= PAD - 0.5) & (fit.column < PAD + len(view.azimuth) - 0.5)
+    if keep.any():  # what is softer than most edges is a shadow
+        keep &= fit.sharp >= settings.sharpness * np.median(fit.sharp[keep])
+    return keep
+
+
+def _colours(edges, picture, fit):
     """Mean colour [n, 2, 3] in 0..1 on the left and on the right over a segment's rows."""
-    n, width = len(column), picture.shape[1]
-    centre = np.rint(np.nan_to_num(column)).astype(int)[edges.segment] - PAD
+    n, width, segment = len(fit.column), picture.shape[1], edges.segment
+    inside = (edges.row >= fit.first[segment]) & (edges.row <= fit.last[segment])
+    row, segment = edges.row[inside], segment[inside]
+    centre = np.rint(np.nan_to_num(fit.column)).astype(int)[segment] - PAD
     sides = []
     for side in (-1, 1):
         beside = (centre[:, None] + side * np.array(BESIDE)) % width
-        colour = picture[edges.row[:, None], beside].mean(axis=1)
-        sides.append(np.stack([mean(channel, edges.segment, n) for channel in colour.T], -1))
+        colour = picture[row[:, None], beside].mean(axis=1)
+        sides.append(np.stack([mean(channel, segment, n) for channel in colour.T], -1))
     return (np.stack(sides, 1) / 255).astype(np.float32)
 
 
