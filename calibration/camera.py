@@ -1,0 +1,332 @@
+"""Calibration of a camera from images of a chessboard: `calibrate_camera`.
+
+Corners -> a first solution by linear equations -> bundle adjustment with a growing model, from the
+two lowest terms of the polynomial up (a start at full order diverges) -> outlier corners found and
+looked for again -> covariance, coverage and bearing uncertainty. The order is the one that predicts
+the corners of left-out boards best: errors of corners are alike within a board, so BIC, which takes
+them for independent, asks for more than that.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.bundle import OUTLIER, Corners, Solution, adjust, freedom, robust_scale
+from calibration.corners import VARIANTS, board_points, check_board, find_again, find_views
+from calibration.coverage import Bearings, Coverage, bearings, coverage, warnings
+from calibration.initial import first_solution
+from jaxslam.vision.camera import Camera, parameter_names
+
+LEAST_BOARDS, LEAST_CORNERS = 3, 8
+ORDERS = (4, 5, 6)
+TIE = 1.01  # a lower order is taken if its held-out RMS is within this factor of the best
+WORST = 1.0  # deg: a calibration whose bearings are less sure than that is refused
+START = ("a0", "a2", "cx", "cy"), ("a3", "a4"), ("c", "e", "p1", "p2")
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A camera and what supports it. All residuals in px, of every corner, outliers included."""
+
+    camera: Camera
+    solution: Solution
+    corners: Corners
+    names: list  # of the images used, one a board
+    rejected: list  # (name, reason)
+    order: int | None
+    scores: dict  # order -> (RMS px, RMS px of boards left out, NaN if not tried)
+    variant: str  # how the corners were localised
+    again: int  # corners that were outliers and were found again
+    coverage: Coverage
+    bearings: Bearings
+    warnings: list
+
+    @property
+    def mean(self):
+        return float(self.solution.distance.mean())
+
+    @property
+    def rms(self):
+        return self.solution.rms
+
+    @property
+    def per_image(self):
+        """(name, corners, mean, RMS, largest residual px) of each image."""
+        rows = []
+        for b, name in enumerate(self.names):
+            d = self.solution.distance[self.corners.board == b]
+            rows.append((name, len(d), d.mean(), math.sqrt(np.mean(d**2)), d.max()))
+        return rows
+
+    @property
+    def outliers(self):
+        """(name, index of the corner on its board, residual px) of corners that don't count."""
+        start = np.searchsorted(self.corners.board, self.corners.board)
+        return [
+            (self.names[self.corners.board[i]], int(i - start[i]), float(self.solution.distance[i]))
+            for i in np.flatnonzero(self.solution.weight == 0)
+        ]
+
+
+def calibrate_camera(
+    source,
+    board=(6, 7),
+    square=0.03,
+    model="polynomial",
+    mirror=False,
+    lens="up",
+    order=None,
+    progress=None,
+):
+    """`Calibration` from images (folder, pattern or list) of a chessboard.
+
+    `board`: inner corners along a row and rows; `square` m; `order` of the polynomial: 4 to 6, or
+    None to choose. `progress(done, total)` counts images. Raises `ValueError`.
+    """
+    check_board(board, square)
+    views = find_views(source, board, progress)
+    points = board_points(board, square)
+    given = dict(size=views.size, model=model, mirror=mirror, lens=lens)
+    trials = []
+    for variant in VARIANTS:
+        kept, corners, _ = _gather(views.corners[variant], points, views.size, views.names)
+        solution = _grow(corners)[0]
+        trials.append((_inlier_rms(solution), variant, corners, solution))
+    _, variant, corners, solution = min(trials, key=lambda trial: trial[0])
+    pixels, again = _find_outliers_again(views.files, corners, solution, board)
+    result = calibrate_corners(pixels, points, names=views.names, order=order, **given)
+    return replace(result, variant=variant, again=again, rejected=views.rejected + result.rejected)
+
+
+def calibrate_corners(
+    pixels,
+    points,
+    size,
+    model="polynomial",
+    mirror=False,
+    lens="up",
+    order=None,
+    names=None,
+):
+    """`Calibration` from given corners: `pixels`, a list of [n, 2] px, one a board.
+
+    `points`: [n, 2] m on the board, one array for all or a list; boards may be partial. `size`:
+    (width, height). Raises `ValueError`.
+    """
+    if model == "polynomial" and order not in (None, *ORDERS):
+        raise ValueError(f"order {order!r} of the polynomial: must be 4, 5 or 6")
+    names = [f"board {i}" for i in range(len(pixels))] if names is None else list(names)
+    names, corners, rejected = _gather(pixels, points, size, names)
+    fits = _fits(corners, model, order)
+    misfit = _misfitting(corners, next(iter(fits.values())))
+    if misfit:
+        share = "half of its corners are outliers: another board, or corners in a wrong order"
+        rejected += [(names[b], share) for b in misfit]
+        left = [b for b in range(corners.boards) if b not in misfit]
+        names, corners = [names[b] for b in left], corners.of_boards(left)
+        _enough(len(names), rejected)
+        fits = _fits(corners, model, order)
+    order, scores = _choose(corners, fits, model, order)
+    solution = fits[order]
+    camera = _camera(solution, corners, model, mirror, lens)
+    cover = coverage(camera, corners, np.linalg.norm(solution.translation, axis=1))
+    uncertain = bearings(camera, cover.radius)
+    told = warnings(corners, names, cover, uncertain)
+    _refuse(cover, uncertain, told)
+    return Calibration(
+        camera=camera,
+        solution=solution,
+        corners=corners,
+        names=names,
+        rejected=rejected,
+        order=order if model == "polynomial" else None,
+        scores={key: (fit.rms, scores.get(key, math.nan)) for key, fit in fits.items()},
+        variant="given",
+        again=0,
+        coverage=cover,
+        bearings=uncertain,
+        warnings=told,
+    )
+
+
+def held_out(corners, fits, model, order=None, folds=2):
+    """{order: residuals' lengths [n] px} of boards by cameras that were fitted to the others.
+
+    `fits`: {order: `Solution`} of all boards; the poses of those left out are estimated anew, the
+    camera held. `order`: of the polynomial, at most.
+    """
+    length = {key: np.empty(len(corners.pixel)) for key in fits}
+    for fold in range(folds):
+        out = np.arange(corners.boards) % folds == fold
+        inside, outside = corners.of_boards(np.flatnonzero(~out)), np.flatnonzero(out)
+        outer = corners.of_boards(outside)
+        for key, fit in _fits(inside, model, order).items():
+            poses = fits[key].rotation[outside], fits[key].translation[outside]
+            rest = adjust(model, outer, Solution(fit.params, *poses), freedom(model, ()))
+            length[key][out[corners.board]] = rest.distance
+    return length
+
+
+def _choose(corners, fits, model, order):
+    """The order to take and {order: RMS px on boards left out}, outliers left aside."""
+    if model == "unified" or order or corners.boards < 2 * LEAST_BOARDS:
+        return order if order in fits else next(iter(fits)), {}
+    good = next(iter(fits.values())).weight > 0
+    left = held_out(corners, fits, model)
+    scores = {key: math.sqrt(np.mean(d[good] ** 2)) for key, d in left.items()}
+    near = [key for key in fits if scores[key] < TIE * min(scores.values())]
+    return near[0], scores
+
+
+def _gather(pixels, points, size, names):
+    """Names and `Corners` of the boards that can be used, and the (name, reason) of the others."""
+    if len(pixels) != len(names):
+        raise ValueError(f"{len(pixels)} boards but {len(names)} names")
+    one = not isinstance(points, (list, tuple))
+    kept, rejected = [], []
+    for i, (name, pixel) in enumerate(zip(names, pixels, strict=True)):
+        pixel = np.asarray(pixel, float)
+        point = np.asarray(points if one else points[i], float)
+        fault = _fault(pixel, point, size)
+        if fault:
+            rejected.append((name, fault))
+        else:
+            kept.append((name, pixel, point))
+    _enough(len(kept), rejected)
+    names, pixels, points = zip(*kept, strict=True)
+    board = np.repeat(np.arange(len(kept)), [len(p) for p in pixels])
+    corners = Corners(np.concatenate(pixels), np.concatenate(points), board, tuple(map(int, size)))
+    return list(names), corners, rejected
+
+
+def _fault(pixel, point, size):
+    """Why a board's corners can't be used; None if they can."""
+    if pixel.shape != point.shape or pixel.ndim != 2 or pixel.shape[1] != 2:
+        return f"{len(pixel)} corners for {len(point)} points of the board"
+    if not (np.isfinite(pixel).all() and np.isfinite(point).all()):
+        return "its corners are not finite"
+    if len(pixel) < LEAST_CORNERS:
+        return f"{len(pixel)} corners; must be {LEAST_CORNERS} or more"
+    spread = np.linalg.svd(point - point.mean(0), compute_uv=False)
+    if spread[1] < 1e-3 * spread[0]:
+        return "its points lie on one line"
+    if (pixel < -0.5).any() or (pixel > np.array(size) - 0.5).any():
+        return f"corners outside the image of {size[0]} x {size[1]}"
+    return None
+
+
+def _enough(count, rejected):
+    if count < LEAST_BOARDS:
+        why = f"; {rejected[0][0]}: {rejected[0][1]}" if rejected else ""
+        raise ValueError(f"{count} usable boards; must be {LEAST_BOARDS} or more{why}")
+
+
+def _grow(corners):
+    """The polynomial of order 4 with affine and decentring, and the names that are free in it."""
+    solution, names = first_solution(corners), []
+    solution = adjust("polynomial", corners, solution, freedom("polynomial", ()), steps=10)
+    for more in START:
+        names += more
+        solution = adjust("polynomial", corners, solution, freedom("polynomial", names))
+    return _without_outliers("polynomial", corners, solution), names
+
+
+def _fits(corners, model, order):
+    """{order: `Solution`} up to `order`, or up to the highest; {"unified": ...} of that model."""
+    solution, names = _grow(corners)
+    if model == "unified":
+        return {model: _unified(corners, solution)}
+    fits = {4: solution}
+    for higher in range(5, (order or max(ORDERS)) + 1):
+        names = [*names, f"a{higher}"]
+        start = replace(solution, weight=None)
+        solution = adjust(model, corners, start, freedom(model, names))
+        fits[higher] = solution = _without_outliers(model, corners, solution)
+    return fits
+
+
+def _unified(corners, polynomial):
+    """The unified model, begun as a parabolic mirror (xi = 1) that agrees at the centre."""
+    params = np.zeros(len(parameter_names("unified")))
+    focal = polynomial.params[7] * max(corners.size)  # xi = 1: z = (f^2 - rho^2) / (2 f)
+    params[:6] = *polynomial.params[:2], focal, focal, 0, 1
+    start = replace(polynomial, params=params, weight=None)
+    for names in (("fx", "fy"), ("fx", "fy", "cx", "cy", "xi"), parameter_names("unified")):
+        start = adjust("unified", corners, start, freedom("unified", names))
+    return _without_outliers("unified", corners, start)
+
+
+def _without_outliers(model, corners, solution):
+    """The solution fitted again without gross outliers, until they stay the same."""
+    for _ in range(5):
+        scale = robust_scale(solution.distance[solution.weight > 0])
+        weight = (solution.distance < OUTLIER * scale).astype(float)
+        if (weight == solution.weight).all():
+            break
+        solution = adjust(model, corners, replace(solution, weight=weight), solution.free)
+    return solution
+
+
+def _inlier_rms(solution):
+    return math.sqrt(np.mean(solution.distance[solution.weight > 0] ** 2))
+
+
+def _misfitting(corners, solution):
+    """Boards with outliers for half of their corners."""
+    bad = np.bincount(corners.board, solution.weight == 0) / np.bincount(corners.board)
+    return np.flatnonzero(bad >= 0.5).tolist()
+
+
+def _find_outliers_again(files, corners, solution, board):
+    """Pixels of every board with outliers replaced by what lies where the camera expects them;
+    the number of those replaced."""
+    pixels, again = [], 0
+    for b, file in enumerate(files):
+        own = corners.board == b
+        pixel, lost = corners.pixel[own].copy(), solution.weight[own] == 0
+        if 0 < lost.sum() < 0.5 * len(lost):
+            predicted = pixel + solution.residual[own]
+            pixel[lost] = find_again(file, predicted, board)[lost]
+            again += int(lost.sum())
+        pixels.append(pixel)
+    return pixels, again
+
+
+def _camera(solution, corners, model, mirror, lens):
+    """`Camera` with the covariance of its parameters and the elevations that the boards cover."""
+    information, good = solution.information, solution.weight > 0
+    degrees = 2 * good.sum() - solution.free.shape[1] - 6 * corners.boards
+    variance = np.sum(solution.distance[good] ** 2) / max(degrees, 1)
+    size = np.sqrt(np.diagonal(information))
+    scaled = information / np.outer(size, size)
+    if not np.isfinite(scaled).all() or np.linalg.cond(scaled) > 1e13:
+        raise ValueError("the boards don't determine the camera: place and tilt them differently")
+    covariance = variance * np.linalg.inv(scaled) / np.outer(size, size)
+    covariance = solution.free @ covariance @ solution.free.T
+    count = len(solution.params)
+    if model == "polynomial":  # an order below 6 ends early
+        count = 1 + int(np.flatnonzero(solution.free.any(1))[-1])
+    camera = Camera(
+        *corners.size,
+        model,
+        solution.params[:count],
+        mirror=mirror,
+        lens=lens,
+        covariance=covariance[:count, :count],
+    )
+    high = np.arcsin(camera.direction(corners.pixel)[:, 2].clip(-1, 1))
+    return replace(camera, elevation=(float(high.min()), float(high.max())))
+
+
+def _refuse(cover, uncertain, told):
+    """Raise `ValueError` for boards that leave the bearings open."""
+    why = "".join(f"; {warning}" for warning in told)
+    if cover.gap > np.radians(240):
+        covered = 360 - np.degrees(cover.gap)
+        raise ValueError(f"all corners lie within {covered:.0f}° of azimuth{why}")
+    if not uncertain.rms_deg < WORST:
+        raise ValueError(
+            f"the boards leave the bearings uncertain by {uncertain.rms_deg:.2g}° (more than"
+            f" {WORST:g}°){why}"
+        )
