@@ -1,36 +1,48 @@
-"""Camera files: our own readable TOML, with covariances."""
+"""Camera files: our own readable TOML, with covariances, and those of other tools.
+
+`calib_results.txt` of OCamCalib, camchain YAML of Kalibr (omni + radtan) and YAML of OpenCV
+(camera_matrix, distortion_coefficients, xi of omnidir) know neither covariances nor how the camera
+sits on the robot. Errors are `ValueError` naming file, field and what was found.
+"""
 
 import os
 import tomllib
+from dataclasses import fields
 from pathlib import Path
 
-import numpy as np
-
-from jaxslam.vision.camera import Camera, parameter_names
+from jaxslam.vision.camera import MODELS, Camera, parameter_names
+from jaxslam.vision.camera_formats import (
+    from_kalibr,
+    from_ocamcalib,
+    from_opencv,
+    to_kalibr,
+    to_ocamcalib,
+    to_opencv,
+)
 
 MAX_BYTES = 1 << 20
+FORMATS = ("toml", "ocamcalib", "kalibr", "opencv")
+BY_SUFFIX = {".toml": "toml", ".txt": "ocamcalib", ".yaml": "opencv", ".yml": "opencv"}
 
 
-def save_camera(path, camera):
-    """Write a camera as TOML, all or nothing. Raises `ValueError` when it can't be written."""
+def save_camera(path, camera, kind=None):
+    """Write a camera, all or nothing; `kind`: one of `FORMATS`, None: by the name's ending.
+
+    Raises `ValueError` where it can't be written, or the format has no room for the model.
+    """
     path = Path(path)
-    lines = [f"width = {camera.width}\n", f"height = {camera.height}\n"]
-    lines += [f'model = "{camera.model}"\n', f"mirror = {str(camera.mirror).lower()}\n"]
-    lines += [f'lens = "{camera.lens}"\n']
-    for name in ("yaw", "roll", "pitch"):
-        lines.append(f"{name} = {getattr(camera, name)!r}  # rad\n")
-    lines.append(f"position = {list(camera.position)}  # m on the robot: forward, left, height\n")
-    lines.append(f"elevation = {list(camera.elevation)}  # rad, least and largest\n\n[params]\n")
-    values = camera.params.tolist()
-    lines += [f"{name} = {value!r}\n" for name, value in zip(camera.names, values, strict=True)]
-    if camera.covariance is not None:
-        lines.append("\n[covariance]  # of the params, in their order\n")
-        rows = zip(camera.names, camera.covariance.tolist(), strict=True)
-        lines += [f"{name} = {row}\n" for name, row in rows]
+    kind = kind or BY_SUFFIX.get(path.suffix.lower())
+    if kind not in FORMATS:
+        raise ValueError(f"{path}: ends in none of {', '.join(BY_SUFFIX)}")
+    writers = dict(zip(FORMATS, (_to_toml, to_ocamcalib, to_kalibr, to_opencv), strict=True))
+    try:
+        text = writers[kind](camera)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with open(temporary, "w", encoding="utf-8", newline="\n") as file:
-            file.writelines(lines)
+            file.write(text)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -40,24 +52,88 @@ def save_camera(path, camera):
         temporary.unlink(missing_ok=True)
 
 
-def load_camera(path):
-    """`Camera` of a TOML file. Raises `ValueError` naming file, field and what is wrong."""
+def load_camera(path, mirror=False, lens="up"):
+    """`Camera` of a file: .toml, .txt of OCamCalib, .yaml of Kalibr (its cam0) or OpenCV.
+
+    `mirror` and `lens` as in `Camera`, for files that don't tell. Raises `ValueError`.
+    """
     path = Path(path)
+    kind = BY_SUFFIX.get(path.suffix.lower())
+    if kind is None:
+        raise ValueError(f"{path}: ends in none of {', '.join(BY_SUFFIX)}")
+    text = _text(path)
+    try:
+        if kind == "toml":
+            return _from_toml(text)
+        if kind == "ocamcalib":
+            found = from_ocamcalib(text)
+        else:
+            found = (from_opencv if text.startswith("%YAML") else from_kalibr)(text)
+        return Camera(**found, mirror=mirror, lens=lens)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _text(path):
     try:
         with open(path, "rb") as file:
-            table = tomllib.loads(file.read(MAX_BYTES).decode("utf-8"))
+            content = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise ValueError(f"{path}: can't be read ({error.strerror})") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: is not TOML ({error})") from error
-    params = table.pop("params", None)
-    covariance = table.pop("covariance", None)
+    if len(content) > MAX_BYTES:
+        raise ValueError(f"{path}: over {MAX_BYTES} bytes, so it is no camera file")
     try:
-        names = parameter_names(table.get("model"), len(params))
-        ordered = [params[name] for name in names]
-        matrix = None if covariance is None else np.array([covariance[name] for name in names])
-        return Camera(params=ordered, covariance=matrix, **table)
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{path}: lacks or misnames {error}") from error
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        return content.decode("utf-8")
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: is not text, so it is no camera file") from None
+
+
+def _to_toml(camera):
+    lines = [f"width = {camera.width}", f"height = {camera.height}  # px"]
+    lines += [f'model = "{camera.model}"', f"mirror = {str(camera.mirror).lower()}"]
+    lines += [f'lens = "{camera.lens}"  # where it points on the robot: up or down']
+    for name in ("yaw", "roll", "pitch"):
+        lines.append(f"{name} = {getattr(camera, name)!r}  # rad")
+    lines.append(f"position = {list(camera.position)}  # m on the robot: forward, left, height")
+    lines += [f"elevation = {list(camera.elevation)}  # rad, least and largest", "", "[params]"]
+    values = camera.params.tolist()
+    lines += [f"{name} = {value!r}" for name, value in zip(camera.names, values, strict=True)]
+    if camera.covariance is not None:
+        lines += ["", "[covariance]  # of the params, in their order"]
+        rows = zip(camera.names, camera.covariance.tolist(), strict=True)
+        lines += [f"{name} = {row}" for name, row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _from_toml(text):
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"is not TOML ({error})") from None
+    known = [field.name for field in fields(Camera)]
+    for name in table:
+        if name not in known:
+            raise ValueError(f"{name} is no field; there are: {', '.join(known)}")
+    for name in ("width", "height", "model", "params"):
+        if name not in table:
+            raise ValueError(f"{name} is missing")
+    if table["model"] not in MODELS:
+        raise ValueError(f"model is {table['model']!r}; must be one of {', '.join(MODELS)}")
+    if not isinstance(table.get("mirror", False), bool):
+        raise ValueError(f"mirror is {table['mirror']!r}; must be true or false")
+    names = parameter_names(table["model"], len(table["params"]))
+    for part in ("params", "covariance"):
+        if part in table:
+            table[part] = _ordered(table[part], part, names)
+    return Camera(**table)
+
+
+def _ordered(values, part, names):
+    """A table's values in the order of `names`, all of which it must have."""
+    if not isinstance(values, dict):
+        raise ValueError(f"{part} is {values!r}; must be a table, [{part}]")
+    for name in {**dict.fromkeys(names), **values}:
+        if name not in values or name not in names:
+            fault = "is missing" if name in names else "is none of the model's params"
+            raise ValueError(f"{part}.{name} {fault}")
+    return [values[name] for name in names]
