@@ -20,12 +20,13 @@ from jaxslam.vision.panorama import directions, panorama, unwrap
 
 PASSES = ((0.12, 0.25), (0.02, 0.1), (0.01, 0.08))  # tilt [rad] and slope [columns per row] allowed
 LENGTH, GAP = 0.18, 0.03  # rad, of the lines used
-CONTRAST, SIGNIFICANCE = 2.0, 5.0  # see `LineSettings`
+CONTRAST, SIGNIFICANCE = 1.2, 5.0  # grey levels per column; times the noise
 LEAST_LINES = 12
 LEAST_PER_IMAGE = 5  # lines, for an estimate from one image alone
 BLOCK, FLOOR = 7, 0.1  # rows whose peaks go together; columns, error of their mean at best
 GRID = 41  # trial tilts each way
 SPREAD = 0.004  # rad: how far from its plane up may be for a line that is vertical, at the start
+ONE_SIDED = 0.05  # spread of the lines' azimuths [rad] that is too little
 BIWEIGHT = 4.685  # robust standard deviations
 
 
@@ -34,7 +35,7 @@ class Tilt:
     """`roll` and `pitch` [rad] of the camera as a `Camera` takes them, `covariance` [2, 2] of them.
 
     `lines` used of `candidates` in `images` images; `per_image` (name, roll, pitch, lines) of those
-    with enough of their own; `scatter` [rad] of a line about the result; `skipped` images by reason.
+    with enough of their own; `scatter` [rad] of a line about it; `skipped` images by reason.
     """
 
     roll: float
@@ -61,24 +62,16 @@ def tilt(images, camera, progress=None):
 
     Raises `ValueError` when there are too few vertical lines, or all on one side.
     """
+    total = len(PASSES) * len(images)
     for step, (most, slope) in enumerate(PASSES):
-        skipped, names = {}, []
-        found, used = [], 0
-        for done, (name, image) in enumerate(images):
-            names.append(name)
-            try:
-                if isinstance(image, ValueError):
-                    raise image
-                check_size(image, camera, name)
-            except ValueError as error:
-                reason = str(error).removeprefix(f"{name}: ")
-                skipped[reason] = skipped.get(reason, 0) + 1
-                continue
-            found.append(_normals(image, camera, slope, done))
-            used += 1
+        before = step * len(images)
+
+        def report(done, before=before):
             if progress:
-                progress(step * len(images) + done + 1, len(PASSES) * len(images))
-        lines = _joined(found, used, skipped)
+                progress(before + done, total)
+
+        found, names, skipped = _look(images, camera, slope, report)
+        lines = _joined(found, skipped)
         up, weight = _up(lines, most)
         camera = camera_with_up(camera, up)
     kept = weight > 0
@@ -89,7 +82,7 @@ def tilt(images, camera, progress=None):
         covariance=_covariance(lines, up, weight),
         lines=int(kept.sum()),
         candidates=len(weight),
-        images=used,
+        images=len(found),
         scatter=float(1.4826 * np.median(np.abs(residual))),
         per_image=_per_image(lines, weight, camera, names),
         skipped=skipped,
@@ -103,15 +96,15 @@ def camera_with_tilt(camera, found):
 
 def describe(found):
     """Two lines for whoever turns the screws of the mount."""
-    errors = np.sqrt(np.diag(found.covariance))
-    rows = (
-        ("pitch", found.pitch, errors[1], "raise the front" if found.pitch > 0 else "lower the front"),
-        ("roll", found.roll, errors[0], "lower the left" if found.roll > 0 else "raise the left"),
-    )
+    roll_error, pitch_error = np.degrees(np.sqrt(np.diag(found.covariance)))
+    front = "raise the front" if found.pitch > 0 else "lower the front"
+    left = "lower the left" if found.roll > 0 else "raise the left"
     return "\n".join(
-        f"{name} {degrees(angle):+.2f} +- {degrees(error):.2f} deg: {what} by "
-        f"{abs(degrees(angle)):.2f} deg"
-        for name, angle, error, what in rows
+        f"{name} {angle:+.2f} +- {error:.2f} deg: {what} by {abs(angle):.2f} deg"
+        for name, angle, error, what in (
+            ("pitch", degrees(found.pitch), pitch_error, front),
+            ("roll", degrees(found.roll), roll_error, left),
+        )
     )
 
 
@@ -121,14 +114,30 @@ def camera_with_up(camera, up):
     return replace(camera, roll=float(np.arctan2(y, z)), pitch=float(-np.arcsin(x)))
 
 
+def _look(images, camera, slope, report):
+    """`Normals` of each usable image, all names, and the skipped images' reasons with counts."""
+    found, names, skipped = [], [], {}
+    for index, (name, image) in enumerate(images):
+        names.append(name)
+        try:
+            if isinstance(image, ValueError):
+                raise image
+            check_size(image, camera, name)
+        except ValueError as error:
+            reason = str(error).removeprefix(f"{name}: ")
+            skipped[reason] = skipped.get(reason, 0) + 1
+        else:
+            found.append(_normals(image, camera, slope, index))
+        report(index + 1)
+    return found, names, skipped
+
+
 def _normals(image, camera, slope, index):
     """`Normals` of one image's nearly vertical lines."""
     view = panorama(camera)
     spacing = (view.elevation[0] - view.elevation[-1]) / (len(view.elevation) - 1)
     length, gap = (max(2, round(angle / spacing)) for angle in (LENGTH, GAP))
-    edges = find_edges(
-        unwrap(image, view), view.valid, CONTRAST, SIGNIFICANCE, length, gap, slope
-    )
+    edges = find_edges(unwrap(image, view), view.valid, CONTRAST, SIGNIFICANCE, length, gap, slope)
     n = int(edges.segment.max(initial=-1)) + 1
     ray = directions(view.bearing(edges.column - PAD), view.elevation[edges.row])
     moment = np.stack(
@@ -145,16 +154,15 @@ def _normals(image, camera, slope, index):
     return Normals(vector[once, :, 0], sigma[once], np.full(int(once.sum()), index))
 
 
-def _joined(found, used, skipped):
-    lines = Normals(*(np.concatenate(part) for part in zip(*found, strict=True))) if found else None
-    if lines is None or len(lines.sigma) < LEAST_LINES:
-        count = 0 if lines is None else len(lines.sigma)
-        reasons = "; ".join(f"{count} skipped: {reason}" for reason, count in skipped.items())
+def _joined(found, skipped):
+    lines = sum(len(normals.sigma) for normals in found)
+    if lines < LEAST_LINES:
+        reasons = "".join(f"; {count} skipped: {reason}" for reason, count in skipped.items())
         raise ValueError(
-            f"tilt: {count} nearly vertical lines in {used} images; at least {LEAST_LINES} are "
-            f"needed{'; ' if reasons else ''}{reasons}"
+            f"tilt: {lines} nearly vertical lines in {len(found)} images; at least {LEAST_LINES} "
+            f"are needed{reasons}"
         )
-    return lines
+    return Normals(*(np.concatenate(part) for part in zip(*found, strict=True)))
 
 
 def _up(lines, most):
@@ -171,7 +179,7 @@ def _up(lines, most):
         scale = BIWEIGHT * np.hypot(lines.sigma, min(robust, SPREAD))
         weight = np.clip(1 - (residual / scale) ** 2, 0, None) ** 2 / scale**2
         normal = lines.normal * np.sqrt(weight)[:, None]
-        if np.linalg.matrix_rank(normal[:, :2], tol=1e-3 * np.linalg.norm(normal)) < 2:
+        if np.linalg.matrix_rank(normal[:, :2], tol=ONE_SIDED * np.linalg.norm(normal)) < 2:
             raise ValueError("tilt: the vertical lines are all in one direction; turn the robot")
         up[:2] = np.linalg.lstsq(normal[:, :2], -normal[:, 2], rcond=None)[0]
     return up, weight

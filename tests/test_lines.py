@@ -123,6 +123,7 @@ def test_merging_reaches_over_the_seam_and_minds_polarity_and_gap():
     def pieces(bearing, low, high, polarity):
         n, ones = len(bearing), np.ones(len(bearing))
         colour = np.full((n, 2, 3), 0.5, np.float32)
+        colour[:, 0] += 0.1 * np.array(polarity)[:, None]
         return Lines(np.array(bearing), 0.001 * ones, np.array(low), np.array(high),
                      np.array(polarity), colour, ones)  # fmt: skip
 

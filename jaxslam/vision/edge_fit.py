@@ -23,7 +23,7 @@ class Fit(NamedTuple):
     """All [n]: `column` (NaN: no peak), `scatter` its standard deviation, `width` of the edge
     (standard deviation of its gradient), all in columns of the padded panorama; `slope` [columns
     per row]; `sign` of the gradient to the right; `strength`, root of the summed squares of the
-    gradient over the rows; `sharp`, 1 - gradient nearby / at the edge; `first`, `last` row."""
+    gradient over its `rows`; `sharp`, 1 - gradient nearby / at the edge; `first`, `last` row."""
 
     column: np.ndarray
     scatter: np.ndarray
@@ -31,6 +31,7 @@ class Fit(NamedTuple):
     slope: np.ndarray
     sign: np.ndarray
     strength: np.ndarray
+    rows: np.ndarray
     sharp: np.ndarray
     first: np.ndarray
     last: np.ndarray
@@ -70,6 +71,7 @@ def fit_segments(edges, columns_per_pixel):
         slope=_slope(edges, n),
         sign=np.where(np.bincount(segment, along, n) >= 0, 1, -1),
         strength=np.sqrt(np.bincount(segment, along**2, n)),
+        rows=np.bincount(segment, minlength=n),
         sharp=1 - np.bincount(segment, beside, n) / np.maximum(size, 1e-9),
         first=first,
         last=last,

@@ -37,7 +37,8 @@ def find_edges(panorama_image, valid, contrast, significance, length, gap, slope
     padded = np.concatenate(
         [panorama_image[:, -PAD:], panorama_image, panorama_image[:, :PAD]], axis=1
     )
-    gradient = cv2.Sobel(padded, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
+    channels = panorama_image[0, 0].size  # so that grey levels are RMS over them
+    gradient = cv2.Sobel(padded, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8 / np.sqrt(channels))
     along = cv2.blur(gradient, (1, SMOOTH_ROWS), borderType=cv2.BORDER_REPLICATE)
     gradient = gradient.reshape(*padded.shape[:2], -1)
     along = along.reshape(gradient.shape)

@@ -9,20 +9,23 @@ from math import pi
 
 import numpy as np
 
-APART = np.linspace(0.01, 7, 141)  # true distances of two edges, in widths
+APART = np.linspace(1.1, 7, 119)  # true distances, in widths: nearer edges cancel each other
+WIDER = 1.15  # the gradient of a sharp edge over its width at the peak
 
 
 def merged(lines, bearing, gap):
     """`Lines` with pieces of one line put together: close in `bearing`, at most `gap` apart [rad].
 
-    Pieces of one line have the same polarity and lie above each other.
+    Pieces of one line lie above each other, and colour changes across them in the same sense.
     """
     n = len(lines.bearing)
     if n < 2:
         return lines
     between = np.maximum(lines.low[:, None] - lines.high, lines.low - lines.high[:, None])
     same = (np.abs(_turn(lines)) <= bearing) & (between <= gap)
-    same &= lines.polarity[:, None] == lines.polarity
+    # not by polarity, which is a toss-up where two colours are equally bright
+    step = (lines.colour[:, 0] - lines.colour[:, 1]).astype(float)
+    same &= (step @ step.T > 0) | np.eye(n, dtype=bool)
     group = np.arange(n)
     for _ in range(n):  # the least index spreads through a group
         least = np.where(same, group, n).min(axis=1)
@@ -47,6 +50,7 @@ def separated(lines, width):
     pair = (part > 0.3) & (lines.polarity[:, None] != lines.polarity)
     square = lines.strength**2
     share = square / (square[:, None] + square)  # the weaker one is pushed farther
+    width = WIDER * width
     seen = np.abs(apart) / width
     true = np.interp(seen, LOOKS, APART, left=APART[0])
     too_far = np.where(pair & (seen < APART[-1]), (seen - true) * width, 0.0)
@@ -84,6 +88,7 @@ def _combined(lines, group):
     part = length / np.bincount(group, length)[group]
     colour = np.zeros((n, 2, 3), np.float32)
     np.add.at(colour, group, (part[:, None, None] * lines.colour).astype(np.float32))
+    turn = np.bincount(group, lines.polarity * lines.strength)
     low, high = np.full(n, np.inf), np.full(n, -np.inf)
     np.minimum.at(low, group, lines.low)
     np.maximum.at(high, group, lines.high)
@@ -92,7 +97,7 @@ def _combined(lines, group):
         sigma=1 / np.sqrt(np.bincount(group, weight)),
         low=low,
         high=high,
-        polarity=lines.polarity[first],
+        polarity=np.where(turn >= 0, 1, -1),
         colour=colour,
         strength=np.sqrt(np.bincount(group, lines.strength**2)),
     )

@@ -19,7 +19,9 @@ from jaxslam.vision.line_pairs import merged, separated
 from jaxslam.vision.panorama import panorama, unwrap
 
 BESIDE = (2, 3, 4)  # columns away from the edge whose mean is the colour beside it
-SOFTER, RAMP = 1.3, 0.5  # an edge so much wider than most may be off by this share of its width
+STEP = np.sqrt(2 * pi)  # height of an edge over width and largest gradient of it
+WIDEST = 1.5  # columns: width of the softest edge that is looked for
+SOFTER, RAMP = 1.1, 0.5  # an edge so much wider than most may be off by this share of its width
 
 
 @dataclass(frozen=True)
@@ -27,17 +29,19 @@ class LineSettings:
     """What counts as a line; validated when made.
 
     `columns` of the panorama, `elevation` (low, high) [rad] of it (None: the camera's);
-    `contrast` [grey levels per column] and `significance` [times the noise of its row] that an edge
-    must have; `length` [rad] of a line at least and `gap` [rad] within it at most; `slope` [columns
-    per row] it may lean; `merge_bearing` and `merge_gap` [rad] between pieces of one line; `floor`
-    [rad] of the standard deviation of a bearing. `merge` pieces, use `colour`: True or False.
+    `contrast`: step at an edge, of the image's mean level, RMS over the colours; `significance`
+    [times the noise of its row]; `evidence`: gradient per column of the mean level, times the root
+    of the rows; `sharpness` of that of most lines; `length` [rad] at least, `gap` [rad] within it
+    at most, `slope` [columns per row] it may lean; `merge_bearing` and `merge_gap` [rad] between
+    pieces of one line; `floor` [rad] of a bearing's standard deviation. `merge` pieces; use
+    `colour`, or brightness alone.
     """
 
     columns: int = 1440
     elevation: tuple[float, float] | None = None
-    contrast: float = 0.07
+    contrast: float = 0.14
     significance: float = 2.7
-    evidence: float = 0.4
+    evidence: float = 0.23
     length: float = 0.13
     gap: float = 0.03
     slope: float = 0.08
@@ -49,7 +53,7 @@ class LineSettings:
     colour: bool = True
 
     def __post_init__(self):
-        for name in ("contrast", "significance", "length", "gap", "slope", "floor"):
+        for name in ("contrast", "significance", "evidence", "length", "gap", "slope", "floor"):
             value = getattr(self, name)
             if not 0 < value < 1e3:
                 raise ValueError(f"lines: {name} {value!r} must be above 0")
@@ -64,8 +68,8 @@ class Lines(NamedTuple):
 
     `bearing` [n] rad in (-pi, pi], `sigma` [n] rad its standard deviation, `low` and `high` [n] rad
     elevations of the ends, `polarity` [n] int, 1: brighter on the left (greater azimuth), else -1,
-    `colour` float32 [n, 2, 3] 0..1 left and right of it, BGR, `strength` [n] grey levels per column
-    of the gradient, summed in squares over its rows.
+    `colour` float32 [n, 2, 3] 0..1 left and right of it, BGR, `strength` [n] gradient per column
+    over the image's mean level, root of the summed squares over its rows.
     """
 
     bearing: np.ndarray
@@ -128,7 +132,7 @@ def _edges(picture, view, settings):
     length, gap = (
         max(2, round(angle / _row_height(view))) for angle in (settings.length, settings.gap)
     )
-    contrast = settings.contrast * level
+    contrast = settings.contrast * level / STEP / WIDEST
     edges = find_edges(
         seen, view.valid, contrast, settings.significance, length, gap, settings.slope
     )
@@ -166,7 +170,9 @@ def _upright(fit, view, settings, level):
     keep = (np.abs(fit.slope) <= settings.slope) & (fit.strength >= settings.evidence * level)
     keep &= (fit.column >= PAD - 0.5) & (fit.column < PAD + len(view.azimuth) - 0.5)
     if keep.any():  # what is softer than most edges is a shadow
+        step = STEP * np.median(fit.width[keep]) * fit.strength / np.sqrt(fit.rows)
         keep &= fit.sharp >= settings.sharpness * np.median(fit.sharp[keep])
+        keep &= step >= settings.contrast * level
     return keep
 
 
