@@ -101,6 +101,7 @@ def _time(log):
         usual = _gaps(log.odometry_time)[0]
         late = int((log.frame_time > last + max(1.0, 10 * usual) * 1e9).sum())
         early = int((log.frame_time < first).sum())
+        early -= early and log.odometry_kind == "command"  # the look before the first command
         text = f"{early} frames before the first odometry, {late} well after the last"
         yield _say(early + late > 0.01 * len(log.frame_time), text)
     for what, time, long in (("odometry", log.odometry_time, 1.0), ("frames", log.frame_time, 60)):

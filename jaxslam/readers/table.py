@@ -63,8 +63,8 @@ def parse(path, lines, width, complete=True, stamped=True, blanks=False):
                 cells = cells + [""] * (width - 1)
             if len(cells) != width:
                 raise ValueError(f"{len(cells)} columns instead of {width}")
-            stamp = _stamp(cells[0]) if stamped else 0
-            good.append((number, stamp, [_number(c, blanks) for c in cells[stamped:]]))
+            time = stamp(cells[0]) if stamped else 0
+            good.append((number, time, [_number(c, blanks) for c in cells[stamped:]]))
         except ValueError as err:
             bad.append((number, str(err)))
     if bad and not complete and bad[-1][0] == lines[-1][0]:
@@ -76,7 +76,7 @@ def parse(path, lines, width, complete=True, stamped=True, blanks=False):
     return Table(Path(path), line, time, value, bad)
 
 
-def _stamp(text):
+def stamp(text):
     """Decimal seconds as int64 ns, exactly: a Unix time in float64 is 0.2 us off."""
     try:
         seconds = Decimal(text)

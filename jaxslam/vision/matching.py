@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 FORBIDDEN = 1e6
+DARK_SIGMA = 0.015  # of 0..1: how much black differs, by noise
 
 
 @dataclass(frozen=True)
@@ -20,9 +21,10 @@ class MatchSettings:
     """`nearest` m: no line is nearer. `typical_depth` m: what lines usually have; the change of
     bearing is the more expected the smaller it is. `gate`: standard deviations beyond the interval
     that are let in. `heading_sigma` rad and `travel_sigma` (share of the distance): the motion's
-    error, where no covariance is given. `colour_sigma` (of 0..1), `elevation_sigma` rad: usual
-    differences of one line in two frames. `unmatched`: cost of leaving a line alone, in the units
-    of half a squared standard deviation. `use_colour`: off, only bearings decide.
+    error, where no covariance is given. `colour_sigma` (share of the brightness) and
+    `elevation_sigma` rad: usual differences of one line in two frames. `unmatched`: cost of leaving
+    a line alone, in units of half a squared standard deviation. `use_colour`: off, only bearings
+    decide.
     """
 
     nearest: float = 0.3
@@ -30,7 +32,7 @@ class MatchSettings:
     gate: float = 3.5
     heading_sigma: float = 0.012
     travel_sigma: float = 0.1
-    colour_sigma: float = 0.06
+    colour_sigma: float = 0.1
     elevation_sigma: float = 0.03
     unmatched: float = 5.0
     use_colour: bool = True
@@ -140,7 +142,9 @@ def _colour_cost(before, after, cost, settings):
     gain = light_gain(one, other, cost)
     dark = np.minimum(gain, 1.0)  # compare in the light of the darker frame: nothing is amplified
     off = other[None, :] * (dark / gain) - one[:, None] * dark
-    per_side = np.mean((off / settings.colour_sigma) ** 2, axis=-1)
+    level = np.maximum(other[None, :] * (dark / gain), one[:, None] * dark)
+    sigma = DARK_SIGMA + settings.colour_sigma * level.mean(axis=-1, keepdims=True)
+    per_side = np.mean((off / sigma) ** 2, axis=-1)
     return np.minimum(per_side, 5.0).sum(axis=-1)
 
 

@@ -4,13 +4,15 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxslam.readers.table import LAST_STAMP_S, read_lines, stamp
+from jaxslam.readers.table import read_lines, stamp
+from jaxslam.vision.images import cv2  # with its limit set
 
 HEADER = ["image", "time_s"]
+NO_TIME = -(1 << 62)
 
 
 def image_times(images, odometry, table=None):
-    """Stamps int64 [n] ns of `Images`, -1 where one has none, and where they are from.
+    """Stamps int64 [n] ns of `Images`, `NO_TIME` where one has none, and where they are from.
 
     The first that applies: `table`, or a `frames.csv` (image,time_s) in the images' folder or the
     one above; commands, if there is one image more than commands: one before the first and one
@@ -25,17 +27,29 @@ def image_times(images, odometry, table=None):
         # Only the order counts: nothing moves between one command's end and the next one's start.
         return np.append(stamps[0] - 10**9, stamps), "one image before and after each command"
     if images.video:
-        step = 1e9 / images.rate
-        return np.rint(np.arange(len(images)) * step).astype(np.int64), "the video's frame rate"
+        frame = np.arange(len(images))
+        return np.rint(frame * (1e9 / _rate(images.video))).astype(np.int64), "the video's rate"
     try:
         return np.array([stamp(Path(name).stem) for name in images.names]), "the images' names"
     except ValueError:
         pass
-    counts = f"{len(images)} images and {len(stamps)} commands" if kind == "command" else "velocities"
+    counts = f"; there are {len(images)} images and {len(stamps)} commands" * (kind == "command")
     raise ValueError(
-        f"{images.names[0]}: no times for the images ({counts}): give a frames.csv (image,time_s), "
-        "name them by their seconds, or take one image before the first command and one after each"
+        f"{images.names[0]}: no times for the images: give a frames.csv (image,time_s), name them "
+        f"by their seconds, or take one before the first command and one after each{counts}"
     )
+
+
+def _rate(path):
+    """Frames per second of a video."""
+    video = cv2.VideoCapture(str(path))
+    try:
+        rate = video.get(cv2.CAP_PROP_FPS)
+    finally:
+        video.release()
+    if not 0 < rate < 1e4:
+        raise ValueError(f"{path}: says no frame rate; give a frames.csv (image,time_s)")
+    return rate
 
 
 def _beside(images):
@@ -59,10 +73,6 @@ def _from_table(images, path):
             times[name] = stamp(cells[1])
         except ValueError as err:
             raise ValueError(f"{path}, line {number}: {name!r}: {err}") from None
-    found = np.array([times.get(name, LAST_STAMP_S * 10**9) for name in images.names])
-    if not (found < LAST_STAMP_S * 10**9).any():
+    if not any(name in times for name in images.names):
         raise ValueError(f"{path}: names none of the images ({images.names[0]}, ...)")
-    return np.where(found < LAST_STAMP_S * 10**9, found, NO_TIME)
-
-
-NO_TIME = -(1 << 62)
+    return np.array([times.get(name, NO_TIME) for name in images.names])
