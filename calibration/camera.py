@@ -23,6 +23,7 @@ ORDERS = (4, 5, 6)
 TIE = 1.01  # a lower order is taken if its held-out RMS is within this factor of the best
 WORST = 1.0  # deg: a calibration whose bearings are less sure than that is refused
 START = ("a0", "a2", "cx", "cy"), ("a3", "a4"), ("c", "e", "p1", "p2")
+NOT_SIMPLE = {"polynomial": ("p1", "p2"), "unified": ("s",)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,25 +78,27 @@ def calibrate_camera(
     mirror=False,
     lens="up",
     order=None,
+    simple=False,
     progress=None,
 ):
     """`Calibration` from images (folder, pattern or list) of a chessboard.
 
     `board`: inner corners along a row and rows; `square` m; `order` of the polynomial: 4 to 6, or
-    None to choose. `progress(done, total)` counts images. Raises `ValueError`.
+    None to choose. `simple`: without decentring (polynomial) or skew (unified), for which files of
+    other tools have no room. `progress(done, total)` counts images. Raises `ValueError`.
     """
     check_board(board, square)
     views = find_views(source, board, progress)
     points = board_points(board, square)
-    given = dict(size=views.size, model=model, mirror=mirror, lens=lens)
+    given = dict(size=views.size, model=model, mirror=mirror, lens=lens, order=order, simple=simple)
     trials = []
     for variant in VARIANTS:
-        kept, corners, _ = _gather(views.corners[variant], points, views.size, views.names)
-        solution = _grow(corners)[0]
+        corners = _gather(views.corners[variant], points, views.size, views.names)[1]
+        solution = _grow(corners, simple)[0]
         trials.append((_inlier_rms(solution), variant, corners, solution))
     _, variant, corners, solution = min(trials, key=lambda trial: trial[0])
     pixels, again = _find_outliers_again(views.files, corners, solution, board)
-    result = calibrate_corners(pixels, points, names=views.names, order=order, **given)
+    result = calibrate_corners(pixels, points, names=views.names, **given)
     return replace(result, variant=variant, again=again, rejected=views.rejected + result.rejected)
 
 
@@ -107,6 +110,7 @@ def calibrate_corners(
     mirror=False,
     lens="up",
     order=None,
+    simple=False,
     names=None,
 ):
     """`Calibration` from given corners: `pixels`, a list of [n, 2] px, one a board.
@@ -118,7 +122,7 @@ def calibrate_corners(
         raise ValueError(f"order {order!r} of the polynomial: must be 4, 5 or 6")
     names = [f"board {i}" for i in range(len(pixels))] if names is None else list(names)
     names, corners, rejected = _gather(pixels, points, size, names)
-    fits = _fits(corners, model, order)
+    fits = _fits(corners, model, order, simple)
     misfit = _misfitting(corners, next(iter(fits.values())))
     if misfit:
         share = "half of its corners are outliers: another board, or corners in a wrong order"
@@ -126,8 +130,8 @@ def calibrate_corners(
         left = [b for b in range(corners.boards) if b not in misfit]
         names, corners = [names[b] for b in left], corners.of_boards(left)
         _enough(len(names), rejected)
-        fits = _fits(corners, model, order)
-    order, scores = _choose(corners, fits, model, order)
+        fits = _fits(corners, model, order, simple)
+    order, scores = _choose(corners, fits, model, order, simple)
     solution = fits[order]
     camera = _camera(solution, corners, model, mirror, lens)
     cover = coverage(camera, corners, np.linalg.norm(solution.translation, axis=1))
@@ -150,7 +154,7 @@ def calibrate_corners(
     )
 
 
-def held_out(corners, fits, model, order=None, folds=2):
+def held_out(corners, fits, model, order=None, simple=False, folds=2):
     """{order: residuals' lengths [n] px} of boards by cameras that were fitted to the others.
 
     `fits`: {order: `Solution`} of all boards; the poses of those left out are estimated anew, the
@@ -161,19 +165,19 @@ def held_out(corners, fits, model, order=None, folds=2):
         out = np.arange(corners.boards) % folds == fold
         inside, outside = corners.of_boards(np.flatnonzero(~out)), np.flatnonzero(out)
         outer = corners.of_boards(outside)
-        for key, fit in _fits(inside, model, order).items():
+        for key, fit in _fits(inside, model, order, simple).items():
             poses = fits[key].rotation[outside], fits[key].translation[outside]
             rest = adjust(model, outer, Solution(fit.params, *poses), freedom(model, ()))
             length[key][out[corners.board]] = rest.distance
     return length
 
 
-def _choose(corners, fits, model, order):
+def _choose(corners, fits, model, order, simple):
     """The order to take and {order: RMS px on boards left out}, outliers left aside."""
     if model == "unified" or order or corners.boards < 2 * LEAST_BOARDS:
         return order if order in fits else next(iter(fits)), {}
     good = next(iter(fits.values())).weight > 0
-    left = held_out(corners, fits, model)
+    left = held_out(corners, fits, model, simple=simple)
     scores = {key: math.sqrt(np.mean(d[good] ** 2)) for key, d in left.items()}
     near = [key for key in fits if scores[key] < TIE * min(scores.values())]
     return near[0], scores
@@ -222,21 +226,21 @@ def _enough(count, rejected):
         raise ValueError(f"{count} usable boards; must be {LEAST_BOARDS} or more{why}")
 
 
-def _grow(corners):
+def _grow(corners, simple):
     """The polynomial of order 4 with affine and decentring, and the names that are free in it."""
     solution, names = first_solution(corners), []
     solution = adjust("polynomial", corners, solution, freedom("polynomial", ()), steps=10)
     for more in START:
-        names += more
+        names += [name for name in more if not (simple and name in NOT_SIMPLE["polynomial"])]
         solution = adjust("polynomial", corners, solution, freedom("polynomial", names))
     return _without_outliers("polynomial", corners, solution), names
 
 
-def _fits(corners, model, order):
+def _fits(corners, model, order, simple):
     """{order: `Solution`} up to `order`, or up to the highest; {"unified": ...} of that model."""
-    solution, names = _grow(corners)
+    solution, names = _grow(corners, simple)
     if model == "unified":
-        return {model: _unified(corners, solution)}
+        return {model: _unified(corners, solution, simple)}
     fits = {4: solution}
     for higher in range(5, (order or max(ORDERS)) + 1):
         names = [*names, f"a{higher}"]
@@ -246,13 +250,14 @@ def _fits(corners, model, order):
     return fits
 
 
-def _unified(corners, polynomial):
+def _unified(corners, polynomial, simple):
     """The unified model, begun as a parabolic mirror (xi = 1) that agrees at the centre."""
     params = np.zeros(len(parameter_names("unified")))
     focal = polynomial.params[7] * max(corners.size)  # xi = 1: z = (f^2 - rho^2) / (2 f)
     params[:6] = *polynomial.params[:2], focal, focal, 0, 1
     start = replace(polynomial, params=params, weight=None)
-    for names in (("fx", "fy"), ("fx", "fy", "cx", "cy", "xi"), parameter_names("unified")):
+    every = [n for n in parameter_names("unified") if not (simple and n in NOT_SIMPLE["unified"])]
+    for names in (("fx", "fy"), ("fx", "fy", "cx", "cy", "xi"), every):
         start = adjust("unified", corners, start, freedom("unified", names))
     return _without_outliers("unified", corners, start)
 

@@ -48,10 +48,12 @@ def check_board(board, square):
 
 
 def find_views(source, board, progress=None):
-    """`Views` of a folder, pattern or list of images.
+    """`Views` of a folder, pattern or list of images (or a list of one folder or pattern).
 
     All images must have one size: the most frequent. Raises `ValueError` if no board is found.
     """
+    if isinstance(source, (list, tuple)) and len(source) == 1:
+        source = source[0]
     images, seen, rejected = Images(source), [], []
     if images.video:
         raise ValueError(f"{source}: a video; give single images of the board")

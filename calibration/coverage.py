@@ -22,10 +22,12 @@ class Coverage(NamedTuple):
 
 
 class Bearings(NamedTuple):
-    """1-sigma azimuth uncertainty rad [radius, azimuth] on the pixels [.., .., 2] of a polar grid,
-    NaN outside the image and near the axis; RMS and maximum in degrees."""
+    """Standard deviations, rad [radius, azimuth], on the pixels [.., .., 2] of a polar grid: of
+    azimuth, NaN outside the image and near the axis, and of the angle from the axis. RMS and
+    maximum in degrees, of azimuth."""
 
     sigma: np.ndarray
+    polar: np.ndarray
     pixel: np.ndarray
     rms_deg: float
     max_deg: float
@@ -52,16 +54,19 @@ def polar_pixels(camera, radius):
     return np.stack([rho * np.cos(around), rho * np.sin(around)], -1) + camera.params[:2]
 
 
-def azimuth_change(ray, change):
-    """Azimuth's change [n, k] rad (about the model's z) when rays [n, 3] change by [n, 3, k].
+def angle_change(ray, change):
+    """Change of azimuth (about the model's z) and of the angle from z, [n, k] rad each, when unit
+    rays [n, 3] change by [n, 3, k].
 
     The rotation common to all, which the boards' poses and the mounting take up, is removed.
     """
     turn = np.cross(np.eye(3)[None], ray[:, None]).transpose(0, 2, 1)  # w x ray = turn @ w
     design, flat = turn.reshape(-1, 3), change.reshape(3 * len(ray), -1)
     rest = (flat - design @ np.linalg.lstsq(design, flat)[0]).reshape(change.shape)
-    x, y = ray[:, :1], ray[:, 1:2]
-    return (x * rest[:, 1] - y * rest[:, 0]) / (x**2 + y**2)
+    x, y, z = (ray[:, i : i + 1] for i in range(3))
+    square = x**2 + y**2
+    outwards = (x * rest[:, 0] + y * rest[:, 1]) / np.sqrt(square)
+    return (x * rest[:, 1] - y * rest[:, 0]) / square, z * outwards - np.sqrt(square) * rest[:, 2]
 
 
 def ray_change(camera, pixel, ray):
@@ -78,12 +83,12 @@ def bearings(camera, radius):
     usable = np.isfinite(ray).all(-1) & (ray[..., 2] < np.cos(FROM_AXIS))
     if not usable.any():  # a narrow lens
         usable = np.isfinite(ray).all(-1)
-    by_params = azimuth_change(ray[usable], ray_change(camera, pixel[usable], ray[usable]))
-    variance = np.einsum("np,pq,nq->n", by_params, camera.covariance, by_params)
-    sigma = np.full(usable.shape, np.nan)
-    sigma[usable] = np.sqrt(variance.clip(0))
-    rms, most = np.sqrt(np.mean(variance)), np.nanmax(sigma)
-    return Bearings(sigma, pixel, float(np.degrees(rms)), float(np.degrees(most)))
+    by_params = angle_change(ray[usable], ray_change(camera, pixel[usable], ray[usable]))
+    sigma = np.full((2, *usable.shape), np.nan)
+    for into, by in zip(sigma, by_params, strict=True):
+        into[usable] = np.sqrt(np.einsum("np,pq,nq->n", by, camera.covariance, by).clip(0))
+    degrees = np.degrees(sigma[0][usable])
+    return Bearings(*sigma, pixel, float(np.sqrt(np.mean(degrees**2))), float(degrees.max()))
 
 
 def azimuth_error(camera, true, radius):
@@ -94,7 +99,7 @@ def azimuth_error(camera, true, radius):
     pixel = known.pixel[usable]
     ray, real = camera.ray(pixel), true.ray(pixel)
     inside = np.isfinite(real).all(1)
-    error = azimuth_change(real[inside], (ray - real)[inside, :, None])[:, 0]
+    error = angle_change(real[inside], (ray - real)[inside, :, None])[0][:, 0]
     return error, known.sigma[usable][inside]
 
 

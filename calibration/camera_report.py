@@ -1,0 +1,165 @@
+"""What a camera calibration found: a text for the terminal and a picture."""
+
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from calibration.coverage import RINGS, SECTORS
+from jaxslam.plot import FILTER, LANDMARK, PLAN, RECKONING, STYLE, TRUE, write_figure
+
+LONGEST = 0.06  # of the image's width: the arrow of the largest residual but outliers
+
+
+def text(found):
+    """Residuals of every image, what was rejected, coverage, bearing uncertainty, warnings."""
+    camera = found.camera
+    model = camera.model + (f" of order {found.order}" if found.order else "")
+    corners = len(found.corners.pixel)
+    lines = [
+        f"{model}, {camera.width} x {camera.height}: {corners} corners of {len(found.names)} boards"
+        f" ({found.variant})",
+        "",
+        *_residuals(found),
+        *_rejected(found),
+        "",
+        *_coverage(found.coverage),
+        "",
+    ]
+    if len(found.scores) > 1:
+        lines += _orders(found) + [""]
+    low, high = np.degrees(camera.elevation)
+    lines += [
+        f"bearing uncertainty (1 sigma): {found.bearings.rms_deg:.3f}° RMS,"
+        f" {found.bearings.max_deg:.3f}° at most; elevations covered: {low:.1f}° to {high:.1f}°"
+    ]
+    return "\n".join(lines + [f"warning: {told}" for told in found.warnings])
+
+
+def _residuals(found):
+    width = max(len(name) for name in [*found.names, "image"])
+    lines = [f"{'image':{width}}  corners  mean   RMS  largest [px]"]
+    for name, count, mean, rms, most in found.per_image:
+        lines.append(f"{name:{width}}  {count:7} {mean:5.3f} {rms:5.3f}  {most:7.2f}")
+    count, most = len(found.solution.distance), found.solution.distance.max()
+    lines.append(f"{'all':{width}}  {count:7} {found.mean:5.3f} {found.rms:5.3f}  {most:7.2f}")
+    return lines
+
+
+def _rejected(found):
+    lines = [f"{found.again} outlier corners were found again"] if found.again else []
+    lines += [
+        f"outlier left aside: {name}, corner {index}: {distance:.1f} px"
+        for name, index, distance in found.outliers
+    ]
+    return lines + [f"rejected: {name}: {reason}" for name, reason in found.rejected]
+
+
+def _orders(found):
+    lines = ["order  RMS [px]  on boards left out"]
+    for order, (rms, left_out) in found.scores.items():
+        lines.append(f"{order:5}  {rms:8.4f}  {left_out:8.4f}{' <' * (order == found.order)}")
+    return lines
+
+
+def _coverage(cover):
+    step, ring = 360 // SECTORS, cover.radius[1] / RINGS
+    lines = ["corners by radius [px] (rows) and direction in the image [°, clockwise from right]"]
+    lines.append("        " + "".join(f"{-180 + step * i:5}" for i in range(SECTORS)))
+    for i in reversed(range(RINGS)):
+        counts = "".join(f"{n or '.':>5}" for n in cover.count[i].tolist())
+        lines.append(f"{f'{i * ring:.0f}-{(i + 1) * ring:.0f}':>8}{counts}")
+    return lines
+
+
+def draw(found, path):
+    """Write the picture: residuals, coverage, radial function, uncertainty of bearings."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(12, 9.4), layout="constrained")
+        (residuals, cover), (radial, bearing) = figure.subplots(2, 2)
+        _draw_residuals(residuals, found)
+        _draw_coverage(cover, found)
+        _draw_radial(radial, found)
+        _draw_bearings(figure, bearing, found)
+        return write_figure(figure, Path(path))
+
+
+def _image_axes(axes, camera, title):
+    width, height = camera.size
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="u [px]", ylabel="v [px]")
+    axes.set_aspect("equal")
+    axes.set_title(title)
+    axes.plot(*camera.params[:2], "+", ms=10, mew=1.6, color=TRUE, label="centre")
+
+
+def _draw_residuals(axes, found):
+    pixel, residual = found.corners.pixel, found.solution.residual
+    good = found.solution.weight > 0
+    longest = found.solution.distance[good].max()
+    scale = longest / (LONGEST * found.camera.width)
+    title = f"residuals, {1 / scale:.0f} times: mean {found.mean:.3f}, RMS {found.rms:.3f} px"
+    _image_axes(axes, found.camera, title)
+    axes.quiver(
+        *pixel[good].T, *residual[good].T, color=FILTER, angles="xy", scale_units="xy",
+        scale=scale, width=0.0018, headwidth=4,
+    )  # fmt: skip
+    if not good.all():
+        axes.plot(*pixel[~good].T, "x", color=LANDMARK, label="outlier left aside")
+    axes.legend(loc="lower right")
+
+
+def _draw_coverage(axes, found):
+    cover = found.coverage
+    title = f"coverage: largest gap in azimuth {np.degrees(cover.gap):.0f}°"
+    _image_axes(axes, found.camera, title)
+    colours = matplotlib.colormaps["viridis"]
+    centre, angle = found.camera.params[:2], np.linspace(0, 2 * np.pi, 181)
+    for i in range(1, RINGS + 1):
+        ring = i * cover.radius[1] / RINGS
+        axes.plot(*(centre[:, None] + ring * np.stack([np.cos(angle), np.sin(angle)])),
+                  color=PLAN, lw=0.7)  # fmt: skip
+    for b in range(found.corners.boards):
+        own = found.corners.pixel[found.corners.board == b]
+        axes.plot(*own.T, ".", ms=4, color=colours(b / max(found.corners.boards - 1, 1)))
+    ring, sector = np.nonzero(cover.count == 0)  # where a board is still wanted
+    rho = (ring + 0.5) * cover.radius[1] / RINGS
+    around = -np.pi + (sector + 0.5) * 2 * np.pi / SECTORS
+    spots = centre + np.stack([rho * np.cos(around), rho * np.sin(around)], 1)
+    axes.plot(*spots.T, "x", color=LANDMARK, ms=5, label="no corner")
+    axes.legend(loc="lower right")
+
+
+def _draw_radial(axes, found):
+    """Angle from the axis over radius, and the standard deviations of both angles."""
+    camera, (low, high) = found.camera, found.coverage.radius
+    rho = np.linspace(0, max(camera.size) / 2, 200)
+    ray = camera.ray(camera.params[:2] + np.stack([rho, 0 * rho], 1))
+    axes.axvspan(low, high, color="#F0F4F8", label="covered by corners")
+    axes.plot(rho, np.degrees(np.arccos(ray[:, 2])), color=TRUE, label="angle from the axis")
+    axes.set(xlabel="radius [px]", ylabel="angle from the axis [°]")
+    axes.set(xlim=(0, rho[-1]), ylim=(0, None))
+    axes.set_title("radial function and its uncertainty")
+    right = axes.twinx()
+    at = np.hypot(*(found.bearings.pixel - camera.params[:2]).T)[0]
+    for name, colour, sigma in (
+        ("azimuth", FILTER, found.bearings.sigma),
+        ("angle from the axis", RECKONING, found.bearings.polar),
+    ):
+        known = np.isfinite(sigma).any(1)
+        squared = np.nanmean(np.degrees(sigma[known]) ** 2, axis=1)
+        right.plot(at[known], np.sqrt(squared), color=colour, ls="--", label=rf"$\sigma$ of {name}")
+    right.set(ylabel=r"$\sigma$ [°], mean over azimuth", ylim=(0, None))
+    right.grid(False)
+    handles = [*axes.get_legend_handles_labels()[0], *right.get_legend_handles_labels()[0]]
+    axes.legend(handles=handles, loc="lower right")
+
+
+def _draw_bearings(figure, axes, found):
+    known = found.bearings
+    title = f"σ of azimuth: {known.rms_deg:.3f}° RMS, {known.max_deg:.3f}° at most"
+    _image_axes(axes, found.camera, title)
+    x, y = np.moveaxis(np.concatenate([known.pixel, known.pixel[:, :1]], 1), -1, 0)
+    sigma = np.degrees(known.sigma[:-1])  # of a cell's first corner
+    mesh = axes.pcolormesh(x, y, sigma, cmap="viridis", vmin=0)
+    figure.colorbar(mesh, ax=axes, label="σ of azimuth [°]", shrink=0.8)
