@@ -12,6 +12,7 @@ from typing import Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
+from jaxslam import cli_images
 from jaxslam.console import DEMO, LogName, Overwrite, Seed, bar, check_new, option, warn, whole
 
 HELP = f"""FastSLAM: from a logged run to map, trajectory and figures.
@@ -29,8 +30,12 @@ app = App(
     default_parameter=Parameter(negative=()),  # no --no-overwrite
     suppress_keyboard_interrupt=False,
 )
-simulate = App(name="simulate", help="Make a log of a simulated world, with its truth.")
+simulate = App(name="simulate", help="Make a simulated world: a log, or images, with the truth.")
 app.command(simulate)
+app.command(cli_images.calibrate)
+app.command(cli_images.extract)
+app.command(cli_images.triangulate)
+simulate.command(cli_images.room)
 
 
 MovedLog = option(str, "where the run's log is, if it was moved") | None

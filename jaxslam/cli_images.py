@@ -1,0 +1,248 @@
+"""The commands that begin at images: calibrate, extract, triangulate, and the rendered room."""
+
+from pathlib import Path
+from typing import Literal
+
+from cyclopts import App
+
+from jaxslam.console import LogName, OutLog, Overwrite, Seed, bar, check_new, option, warn
+
+calibrate = App(name="calibrate", help="Fit a camera, its tilt, or a sensor's errors.")
+
+Source = option(Path, "a folder of images, one image, or a video")
+CameraFile = option(Path, "the camera: .toml, calib_results.txt of OCamCalib, or .yaml")
+Camera = option(Path, "where the camera is written, a .toml file")
+Models = Literal["polynomial", "unified"]
+LensSide = option(Literal["up", "down"], "where the lens points on the robot (a .toml says it itself)")
+Mirror = option(bool, "seen by one mirror, which turns the sense of up (a .toml says it itself)")
+Drives = Literal["loop", "straight", "turn"]
+Presets = Literal["clean", "normal", "hard"]
+Pairs = Literal["consecutive", "disjoint"]
+
+
+@calibrate.command(usage="Usage: jaxslam calibrate camera [OPTIONS] IMAGES...")
+def camera(
+    *images: Source,
+    board: option(str, "inner corners, as 6x7"),
+    square: option(float, "side of a square [m]"),
+    model: option(Models, "polynomial (Scaramuzza) or unified (Mei) model") = "polynomial",
+    mirror: Mirror = False,
+    lens: LensSide = "up",
+    out: Camera = Path("camera.toml"),
+    report: option(Path, "picture of the fit, a .png") = Path("camera.png"),
+    overwrite: Overwrite = False,
+):
+    """Calibrate a mirror or fisheye camera from images of a chessboard.
+
+    Prints the residuals of every image, what was rejected and why, how the corners
+    cover the view, and the uncertainty of bearings in degrees.
+
+    Example: jaxslam calibrate camera boards/ --board 6x7 --square 0.03 --mirror
+    """
+    from calibration.camera import calibrate_camera
+    from calibration.camera_report import draw, text
+    from jaxslam.vision.camera_files import save_camera
+
+    if not images:
+        raise ValueError("calibrate camera: a folder, or files, of images are needed")
+    for path in (out, report):
+        _check_free(path, overwrite)
+    with bar("finding corners") as progress:
+        found = calibrate_camera(
+            list(images) if len(images) > 1 else images[0],
+            _board(board),
+            square,
+            model=model,
+            mirror=mirror,
+            lens=lens,
+            progress=progress,
+        )
+    save_camera(out, found.camera)
+    draw(found, report)
+    print(text(found))
+    print(f"{out}: the camera; {report}: the fit")
+    return int(bool(found.rejected))
+
+
+@calibrate.command
+def tilt(
+    images: Source,
+    /,
+    *,
+    camera: CameraFile,
+    mirror: Mirror = False,
+    lens: LensSide = "up",
+    out: Camera | None = None,
+    overwrite: Overwrite = False,
+):
+    """Find which way is up from the vertical lines of ordinary images of rooms.
+
+    Prints the roll and pitch to correct on the mount; --out writes the camera with
+    the tilt, which then compensates it.
+
+    Example: jaxslam calibrate tilt images/ --camera camera.toml --out level.toml
+    """
+    from calibration.tilt import camera_with_tilt, describe
+    from calibration.tilt import tilt as find_tilt
+    from jaxslam.vision.camera_files import load_camera, save_camera
+    from jaxslam.vision.images import Images
+
+    if out:
+        _check_free(out, overwrite)
+    known = load_camera(camera, mirror, lens)
+    with bar("looking for lines") as progress:
+        found = find_tilt(Images(images), known, progress=progress)
+    print(describe(found))
+    if out:
+        save_camera(out, camera_with_tilt(known, found))
+        print(f"{out}: the camera with this tilt")
+    for why, count in found.skipped.items():
+        warn(f"{count} images skipped: {why}")
+    return int(bool(found.skipped))
+
+
+@calibrate.command
+def sensor(
+    log: LogName,
+    /,
+    *,
+    out: option(Path, "parameter file to write, for run --params") = Path("params.toml"),
+    figure: option(Path, "picture of points and ellipses (the paper's fig. 6)") | None = None,
+    overwrite: Overwrite = False,
+):
+    """Find a sensor's error model from a drive whose truth is known.
+
+    The paper's procedure: drive straight past surveyed lines, look at how bearings
+    and triangulated points lie about them. Says which model of a point's error the
+    data prefer, and by how much, on the half of the drive it was not fitted on.
+
+    Example: jaxslam calibrate sensor straight.npz --out params.toml --figure points.png
+    """
+    from calibration import sensor_report
+    from jaxslam.config import default_params
+    from jaxslam.log import load_log
+    from jaxslam.paramfile import save_params
+
+    for path in (out, figure):
+        if path:
+            _check_free(path, overwrite)
+    drive = load_log(log)
+    with bar("fitting"):
+        report = sensor_report.calibrate_sensor(drive)
+    print(sensor_report.text(report))
+    found, errors = sensor_report.values(report)
+    base = default_params("position" if report.models else "bearing", drive)
+    save_params(out, base._replace(**found), errors)
+    print(f"{out}: for jaxslam run --params")
+    if figure:
+        print(f"{sensor_report.draw(report, drive, figure)}: points, ellipses, surveyed lines")
+
+
+def extract(
+    images: Source,
+    /,
+    *,
+    camera: CameraFile,
+    mirror: Mirror = False,
+    lens: LensSide = "up",
+    odometry: option(Path, ".csv: time_s,distance_m,turn_rad or time_s,forward_m_s,yaw_rate_rad_s"),
+    out: OutLog,
+    truth: option(Path, "folder of poses.csv, landmarks.csv and plan.csv, where known")
+    | None = None,
+    overlay: option(Path, "folder for pictures with the lines drawn in") | None = None,
+    overwrite: Overwrite = False,
+):
+    """Make a log of images: vertical lines, matched and triangulated, with the odometry.
+
+    A folder says when its images were taken in frames.csv (image,time_s); otherwise
+    names that are seconds, a video's own times, or one image per command count.
+    What was interrupted goes on where it stopped.
+
+    Example: jaxslam extract images/ --camera camera.toml --odometry odometry.csv --out OUT.npz
+    """
+    from jaxslam.log import NOT_USED
+    from jaxslam.vision.camera_files import load_camera
+    from jaxslam.vision.extract import extract as run_extract
+
+    check_new(out, overwrite)
+    with bar("extracting lines") as progress:
+        log = run_extract(
+            images,
+            load_camera(camera, mirror, lens),
+            odometry,
+            out,
+            truth=truth,
+            overlay=overlay,
+            overwrite=overwrite,
+            progress=progress,
+        )
+    print(f"{out}: {log}; map it with: jaxslam run {out}")
+    lost = {why: n for why, n in log.skipped.items() if not why.startswith(NOT_USED)}
+    for why, count in lost.items():
+        warn(f"{count} skipped: {why}")
+    return int(bool(lost))
+
+
+def triangulate(log: LogName, out: OutLog, /, *, overwrite: Overwrite = False):
+    """Add points to a log of bearings: matched between frames, triangulated by odometry.
+
+    The paper's way on any log; jaxslam run --sensor position then uses the points.
+
+    Example: jaxslam triangulate lost-in-the-woods OUT.npz
+    """
+    from jaxslam.log import load_log, save_log
+    from jaxslam.vision.points import triangulate_log
+
+    check_new(out, overwrite)
+    with bar("triangulating") as progress:
+        found = triangulate_log(load_log(log), progress=progress)
+    save_log(out, found)
+    print(f"{out}: {found}; map it with: jaxslam run {out} --sensor position")
+
+
+def room(
+    out: option(Path, "folder to write"),
+    /,
+    *,
+    seed: Seed = 0,
+    drive: option(
+        Drives, "round and round, straight along a wall, or turning on the spot"
+    ) = "loop",
+    step: option(float, "between two images [m]") = 0.2,
+    length: option(float, "of the path [m]; of a turn [rad]") | None = None,
+    preset: option(Presets, "light, blur and noise of the images") = "normal",
+    overwrite: Overwrite = False,
+):
+    """Render the drive of a robot through a furnished room, seen by a mirror camera.
+
+    Writes images, commands (slip is in the truth only), cameras, and the truth.
+
+    Example: jaxslam simulate room rooms/1 --seed 1
+    """
+    from jaxslam.render import render_room
+
+    with bar("rendering") as progress:
+        frames = render_room(
+            out,
+            seed=seed,
+            drive=drive,
+            step=step,
+            length=length,
+            preset=preset,
+            overwrite=overwrite,
+            progress=progress,
+        )
+    print(f"{out}: {frames} images; next: jaxslam extract {out / 'images'} --help")
+
+
+def _board(text):
+    """Corners along both sides, of text like 6x7."""
+    sides = [int(side) if side.isdecimal() else 0 for side in text.lower().split("x")]
+    if len(sides) != 2 or min(sides) < 2:
+        raise ValueError(f"--board is {text!r}; must be two counts of inner corners, like 6x7")
+    return tuple(sides)
+
+
+def _check_free(path, overwrite):
+    if path.exists() and not overwrite:
+        raise ValueError(f"{path}: exists; choose another name or add --overwrite")
