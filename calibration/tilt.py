@@ -18,7 +18,13 @@ from jaxslam.vision.edges import PAD, find_edges
 from jaxslam.vision.images import check_size
 from jaxslam.vision.panorama import directions, panorama, unwrap
 
-PASSES = ((0.12, 0.25), (0.02, 0.1), (0.01, 0.08))  # tilt [rad] and slope [columns per row] allowed
+PASSES = (
+    (0.12, 0.25),
+    (0.03, 0.12),
+    (0.02, 0.08),
+    (0.01, 0.08),
+)  # tilt [rad] and slope [columns per row] allowed
+LARGEST = 0.17  # rad, of the tilt that is found
 LENGTH, GAP = 0.18, 0.03  # rad, of the lines used
 CONTRAST, SIGNIFICANCE = 1.2, 5.0  # grey levels per column; times the noise
 LEAST_LINES = 12
@@ -60,9 +66,9 @@ class Normals(NamedTuple):
 def tilt(images, camera, progress=None):
     """`Tilt` of a camera from images: an `Images` or a list of (name, image or `ValueError`).
 
-    Raises `ValueError` when there are too few vertical lines, or all on one side.
+    Raises `ValueError` when there are too few vertical lines, all on one side, or far off.
     """
-    total = len(PASSES) * len(images)
+    total, given = len(PASSES) * len(images), camera
     for step, (most, slope) in enumerate(PASSES):
         before = step * len(images)
 
@@ -73,7 +79,8 @@ def tilt(images, camera, progress=None):
         found, names, skipped = _look(images, camera, slope, report)
         lines = _joined(found, skipped)
         up, weight = _up(lines, most)
-        camera = camera_with_up(camera, up)
+        looked, camera = camera, camera_with_up(camera, up)
+    _check_change(given, camera)
     kept = weight > 0
     residual = lines.normal[kept] @ up
     return Tilt(
@@ -84,7 +91,7 @@ def tilt(images, camera, progress=None):
         candidates=len(weight),
         images=len(found),
         scatter=float(1.4826 * np.median(np.abs(residual))),
-        per_image=_per_image(lines, weight, camera, names),
+        per_image=_per_image(lines, weight, looked, names),
         skipped=skipped,
     )
 
@@ -112,6 +119,16 @@ def camera_with_up(camera, up):
     """The camera turned so that what it takes for the direction `up` [3] points up; yaw is kept."""
     x, y, z = tilt_matrix(camera.roll, camera.pitch).T @ (up / np.linalg.norm(up))
     return replace(camera, roll=float(np.arctan2(y, z)), pitch=float(-np.arcsin(x)))
+
+
+def _check_change(given, found):
+    # the last row of a matrix is up, in the model's frame
+    change = np.arccos(np.clip(given.matrix[2] @ found.matrix[2], -1, 1))
+    if change > LARGEST:
+        raise ValueError(
+            f"tilt: {degrees(change):.0f} deg from the camera file's own; at most "
+            f"{degrees(LARGEST):.0f} can be found: check its calibration, mirror and lens"
+        )
 
 
 def _look(images, camera, slope, report):

@@ -8,6 +8,9 @@ from stripes import mirror_camera, painted, photograph, room_of_stripes, stripes
 
 from calibration.tilt import Tilt, camera_with_tilt, camera_with_up, describe, tilt
 from jaxslam.vision.camera import tilt_matrix
+from jaxslam.vision.camera_files import load_camera
+from jaxslam.vision.images import Images
+from jaxslam.vision.lines import halves
 
 
 def degrees(found):
@@ -99,7 +102,7 @@ def test_images_without_lines_or_of_another_size_are_counted():
     assert found.images == 1
     assert sorted(found.skipped.values()) == [1, 1]
     assert any("64 x 48" in reason for reason in found.skipped)
-    assert calls[-1] == (9, 9)
+    assert calls[-1] == (12, 12)
     plain = photograph(np.full((480, 640, 3), 99.0), 2.0)
     with pytest.raises(ValueError, match=r"tilt: 0 nearly vertical lines in 1 images"):
         tilt([("d.png", plain)], camera)
@@ -116,3 +119,24 @@ def test_lines_on_one_side_alone_do_not_determine_it():
     ]
     with pytest.raises(ValueError, match="one direction"):
         tilt(images, camera)
+
+
+def test_a_camera_that_leans_far_is_refused():
+    camera = mirror_camera(roll=0.3)
+    with pytest.raises(ValueError, match="tilt: "):
+        tilt(rooms(camera, 2), replace(camera, roll=0.0))
+
+
+def test_a_recorded_camera_leans_as_far_as_others_found(shared_data):
+    """OCamCalib's images: 0.25 to 0.59 degrees; afterwards both halves of a line agree."""
+    folder = shared_data / "calib_ocam_vmr"
+    camera = load_camera(folder / "calib_results_catadioptric.txt", mirror=True)
+    camera = replace(camera, elevation=(-0.87, 0.43))
+    images = list(Images(folder))
+    found = tilt(images, camera)
+    assert 0.25 < np.hypot(*degrees(found)) < 0.59
+    before, after = (
+        np.concatenate([np.subtract(*halves(image, c)) for _, image in images])
+        for c in (camera, camera_with_tilt(camera, found))
+    )
+    assert np.median(np.abs(after)) < min(np.radians(0.1), np.median(np.abs(before)))

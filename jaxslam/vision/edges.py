@@ -27,6 +27,11 @@ class Edges(NamedTuple):
     gradient: np.ndarray
     along: np.ndarray
 
+    def take(self, index):
+        """The peaks of an index or mask; their segments keep their numbers."""
+        part = (column[index] for column in (self.segment, self.row, self.column))
+        return Edges(*part, self.gradient, self.along)
+
 
 def find_edges(panorama_image, valid, contrast, significance, length, gap, slope):
     """`Edges` of a panorama uint8 [H, W, C] and the mask [H, W] of what is seen.

@@ -20,6 +20,7 @@ from jaxslam.vision.panorama import panorama, unwrap
 
 BESIDE = (2, 3, 4)  # columns away from the edge whose mean is the colour beside it
 STEP = np.sqrt(2 * pi)  # height of an edge over width and largest gradient of it
+LEAST_HALF = 6  # rows
 WIDEST = 1.5  # columns: width of the softest edge that is looked for
 SOFTER, RAMP = 1.1, 0.5  # an edge so much wider than most may be off by this share of its width
 
@@ -112,10 +113,14 @@ def halves(image, camera, settings=None):
     keep = _upright(fit, view, settings, level)
     keep &= (fit.last - fit.first) * _row_height(view) >= 2 * settings.length
     lower = edges.row > ((fit.first + fit.last) / 2)[edges.segment]
-    segment = 2 * edges.segment + lower
-    parts = fit_segments(edges._replace(segment=segment), wide).column
-    upper, lower = view.bearing(parts.reshape(-1, 2)[keep] - PAD).T
-    return upper, lower
+    count = [np.bincount(edges.segment, part, len(keep)) for part in (~lower, lower)]
+    keep &= np.minimum(*count) >= LEAST_HALF
+    part = edges.take(keep[edges.segment])
+    segment = 2 * part.segment + lower[keep[edges.segment]]
+    column = fit_segments(part._replace(segment=np.unique(segment, return_inverse=True)[1]), wide)
+    upper, lower = view.bearing(column.column.reshape(-1, 2) - PAD).T
+    both = np.isfinite(upper) & np.isfinite(lower)
+    return upper[both], lower[both]
 
 
 def _panorama(image, camera, settings):
