@@ -18,11 +18,13 @@ from jaxslam.vision.images import Images, cv2
 from jaxslam.vision.lines import Lines, LineSettings, extract_lines, is_dark
 from jaxslam.vision.overlay import draw_on_image
 from jaxslam.vision.partial import Partial
-from jaxslam.vision.points import PointSettings, triangulate_log
+from jaxslam.vision.points import triangulate_log
 from jaxslam.vision.times import NO_TIME, image_times
 
 REACH = 10.0  # m, declared as what the camera can see
 PLAN = ["x1_m", "y1_m", "x2_m", "y2_m"]
+MOTION = ("err_tran", "err_rot", "err_drift", "floor_tran", "floor_rot", "gain_tran", "gain_rot")
+MOTION += ("bias_drift",)
 VIDEO_RATE = 10.0  # frames per second of an overlay video
 CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
 
@@ -37,7 +39,7 @@ def extract(
     truth=None,  # folder of poses.csv, landmarks.csv and plan.csv, those that are known
     lines=None,  # `LineSettings`
     points=None,  # `PointSettings`
-    params=None,  # `Params` of the robot's motion for the points; None: the defaults
+    params=None,  # `Params` of the robot's motion, for the points and declared; None: the defaults
     reach=REACH,  # m
     overlay=None,  # folder for pictures, or an .mp4 or .avi, with the lines drawn in
     overwrite=False,  # replace `out`
@@ -68,7 +70,12 @@ def extract(
     with Partial(partial, settings) as done:
         _look(images, kept, camera, lines, done, overlay, progress)
         log = _log(done.rows, time[kept], kind, table, camera, reach, skipped, _name(source, out))
-    log = triangulate_log(_with_truth(log, truth), params, points or PointSettings())
+    log = _with_truth(log, truth)
+    if params is not None:  # the filter must believe of the motion what the points were made with
+        noise = {name: float(getattr(params, name)) for name in MOTION}
+        log = replace(log, noise=noise)
+        params = params._replace(mount_x=log.mounting[0], mount_y=log.mounting[1], mount_yaw=0.0)
+    log = triangulate_log(log, params, points)
     if out is not None:
         save_log(out, log)
         done.remove()

@@ -25,8 +25,14 @@ from jaxslam.vision.triangulation import (
 )
 
 PAIRS = ("disjoint", "consecutive", "overlapping")
-NEW, SHORT = len(REASONS), len(REASONS) + 1
-WHY = (*REASONS, "first seen here", "driven less than the baseline since first seen")
+NEW, SHORT, MISFIT = range(len(REASONS), len(REASONS) + 3)
+WHY = (
+    *REASONS,
+    "first seen here",
+    "driven less than the baseline since first seen",
+    "the line was elsewhere in between (a false match)",
+)
+MISFIT_SIGMAS = 3.0
 MOST_FRAMES = 400  # looked back, however little the robot has moved
 DEPTH_SIGMAS = 4.0  # of a track's own depth, within which it is looked for again
 
@@ -35,14 +41,20 @@ DEPTH_SIGMAS = 4.0  # of a track's own depth, within which it is looked for agai
 class PointSettings:
     """`baseline` m: the least path by odometry between the two frames of a point; `longest` m: the
     most. `pairs` of one line: "disjoint" (no two share a frame), "consecutive" (the next begins
-    where the last ended) or "overlapping" (from every frame back). `inflation`: factor on the
-    covariances. `memory`: frames for which a line may stay unseen. `sigma` rad: of bearings, for a
-    log that states none."""
+    where the last ended) or "overlapping" (from every frame back). `memory`: frames for which a
+    line may stay unseen. `sigma` rad: of bearings, for a log that states none.
 
-    baseline: float = 0.4
+    Points over the same stretch of road share its error, one line's and all lines' alike, and a
+    filter that takes them as independent grows too sure. A point's covariance stays its own; the
+    log declares a `position_scale` for the filter: the root of `inflation` times the number of
+    points of a line that overlap. To inflate all points was better than to thin them out: see
+    experiments/points.py.
+    """
+
+    baseline: float = 0.8
     longest: float = 2.0
-    pairs: str = "disjoint"
-    inflation: float = 1.0
+    pairs: str = "overlapping"
+    inflation: float = 4.0
     memory: int = 3
     sigma: float | None = None
     matching: MatchSettings = field(default_factory=MatchSettings)
@@ -95,8 +107,8 @@ class _Window:
 
 
 def triangulate_log(log, params=None, settings=None, use_identity=False, progress=None):
-    """The log with `point`, `point_cov` and `point_baseline`, and the bearings without a point
-    counted by reason in `skipped`.
+    """The log with `point`, `point_cov` and `point_baseline`, the bearings without a point counted
+    by reason in `skipped`, and a `position_scale` for the filter unless it declares one.
 
     `params`: the motion's noise and turning gain (None: what the log declares, else the defaults).
     `use_identity`: lines are told apart by the measured identities. `progress(done, total)` in
@@ -129,7 +141,17 @@ def triangulate_log(log, params=None, settings=None, use_identity=False, progres
     skipped = {k: v for k, v in log.skipped.items() if not k.startswith(_PREFIX)}
     counts = np.bincount(why, minlength=len(WHY))
     skipped |= {_PREFIX + WHY[i]: int(counts[i]) for i in range(len(WHY)) if i != OK and counts[i]}
-    return replace(log, point=point, point_cov=cov, point_baseline=base, skipped=skipped)
+    noise = {"position_scale": _scale(base, odometry.distance, settings)} | log.noise
+    found = {"point": point, "point_cov": cov, "point_baseline": base}
+    return replace(log, **found, noise=noise, skipped=skipped)
+
+
+def _scale(base, distance, settings):
+    """`position_scale` for points on these baselines [n] m, of frames these distances [T] apart."""
+    shared = 1.0
+    if settings.pairs == "overlapping" and np.isfinite(base).any():
+        shared = max(1.0, float(np.nanmedian(base) / np.median(distance[distance > 0])))
+    return float(np.sqrt(settings.inflation * shared))
 
 
 _PREFIX = NOT_USED + "bearing without a point: "
@@ -217,10 +239,13 @@ def _measure(tracks, window, lines, settings, out):
     seen = [tracks[i].seen[start[i]] for i in ready]
     row = row[ready]
     found = _triangulate(seen, row, window, lines, settings)
-    point[row] = found.point
-    cov[row] = found.cov * settings.inflation
-    base[row] = np.where(found.ok, window.path[window.index([s[0] for s in seen])], np.nan)
-    why[row] = found.reason
+    between = [_between(tracks[i], start[i], window) for i in ready]
+    fits = _fits(found.point, seen, between, window, lines)
+    point[row] = np.where(fits[:, None], found.point, np.nan)
+    cov[row] = np.where(fits[:, None], found.cov, np.nan)
+    path = window.path[window.index([s[0] for s in seen])]
+    base[row] = np.where(found.ok & fits, path, np.nan)
+    why[row] = np.where(found.ok & ~fits, MISFIT, found.reason)
     for i, reason in zip(ready, found.reason, strict=True):
         # Rays still parallel: the same pair's begin may do later, from farther on.
         if reason != PARALLEL and settings.pairs != "overlapping":
@@ -237,6 +262,29 @@ def _start(track, window, settings):
         return None
     # Overlapping pairs keep to the baseline; the others take all that they have.
     return track.begin + int(far[-1] if settings.pairs == "overlapping" else far[0])
+
+
+def _between(track, start, window):
+    """The sighting half-way between a pair's two, by path; the pair's first if there is none."""
+    frames = [seen[0] for seen in track.seen[start:-1]]
+    path = window.path[window.index(frames)]
+    return track.seen[start + int(np.argmin(np.abs(path - path[0] / 2)))]
+
+
+def _fits(point, seen, between, window, lines):
+    """Whether the sightings between point to where the points are; most false pairs do not."""
+    at, first = (window.index([s[0] for s in some]) for some in (between, seen))
+    row = np.array([s[1] for s in between])
+    x, y, turn = window.motion[at].T
+    c, s = np.cos(turn), np.sin(turn)
+    expected = np.arctan2(
+        y + s * point[:, 0] + c * point[:, 1], x + c * point[:, 0] - s * point[:, 1]
+    )
+    off = np.abs((lines.bearing[row] - expected + np.pi) % (2 * np.pi) - np.pi)
+    # Half-way the two ends hold the heading from either side: a quarter of its variance is left
+    # (a Brownian bridge), and half a bearing's is added by each end's.
+    sigma = np.sqrt(1.5 * lines.sigma[row] ** 2 + window.cov[first, 2, 2] / 4)
+    return ~(off > MISFIT_SIGMAS * sigma)
 
 
 def _triangulate(seen, row, window, lines, settings):
