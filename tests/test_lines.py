@@ -3,6 +3,7 @@
 import time
 from dataclasses import replace
 from math import pi
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -10,6 +11,9 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 from stripes import mirror_camera, painted, photograph, room_of_stripes, stripes
 
+from jaxslam.furnish import furnish
+from jaxslam.render import PRESETS, double_mirror_camera, frames
+from jaxslam.room import visible_edges
 from jaxslam.vision.line_pairs import merged, separated
 from jaxslam.vision.lines import Lines, LineSettings, extract_lines, halves, is_dark
 from jaxslam.vision.overlay import draw_lines, draw_on_image
@@ -287,3 +291,23 @@ def test_a_frame_takes_at_most_twenty_milliseconds():
         seconds.append(time.process_time() - begin)
     cv2.setNumThreads(threads)
     assert np.median(seconds) < 0.02
+
+
+@pytest.mark.parametrize(("preset", "most"), (("clean", 0.1), ("hard", 0.15)))
+def test_the_rendered_rooms_edges_are_found(preset, most):
+    """Bearings against the world's geometry; the issue's limits, on a few frames."""
+    camera, world = double_mirror_camera(), furnish(20)
+    poses = np.array([(1.3, 1.2, 0.4), (4.1, 0.9, 2.0), (6.2, 3.0, -1.0), (8.6, 2.7, -2.5)])
+    drive = SimpleNamespace(pose=poses, command=np.zeros((3, 2)))
+    errors, clear, found, false = [], 0, 0, 0
+    for image, pose, _ in frames(world, camera, drive, PRESETS[preset], seed=20):
+        edges, lines = visible_edges(world, pose), extract_lines(image, camera)
+        i, _, away = paired(edges.bearing, lines)
+        errors.extend(np.degrees(away))
+        plain = (edges.contrast >= 0.1) & (edges.high - edges.low >= np.radians(8))
+        clear, found = clear + plain.sum(), found + plain[i].sum()
+        apart = np.abs(turned(lines.bearing[:, None] - edges.bearing)).min(1)
+        false += (apart > np.radians(1)).sum()
+    assert np.sqrt(np.mean(np.square(errors))) <= most
+    assert found >= 0.8 * clear and clear > 100
+    assert false <= 1
