@@ -152,10 +152,9 @@ class _Linear:
         r, c, p = root * self.residual, root[..., None] * self.camera, root[..., None] * self.pose
         flat = c.reshape(r.size, c.shape[-1])
         cross, own, pull = (
-            np.add.reduceat(np.einsum(how, *pair), self.starts)
-            for how, pair in (("nif,nij->nfj", (c, p)), ("nij,nik->njk", (p, p)),
-                              ("nij,ni->nj", (p, r)))
-        )  # fmt: skip
+            np.add.reduceat(product, self.starts)
+            for product in (c.mT @ p, p.mT @ p, (p.mT @ r[..., None])[..., 0])
+        )
         return flat.T @ flat, cross, own, flat.T @ r.ravel(), pull
 
     def step(self, damping):
@@ -178,7 +177,9 @@ class _Linear:
     def information(self):
         """[F, F] per px^2: of the camera's free directions, whatever the poses are."""
         camera, cross, own, _, _ = self.normal()
-        return camera - np.einsum("bfj,bjg->fg", cross, np.linalg.solve(own, cross.mT))
+        return camera - np.einsum(
+            "bfj,bjg->fg", cross, np.linalg.solve(_damped(own, 0.0), cross.mT)
+        )
 
 
 def robust_scale(length):

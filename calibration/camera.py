@@ -94,7 +94,7 @@ def calibrate_camera(
     trials = []
     for variant in VARIANTS:
         corners = _gather(views.corners[variant], points, views.size, views.names)[1]
-        solution = _grow(corners, simple)[0]
+        solution = _last(_fits(corners, model, order, simple))
         trials.append((_inlier_rms(solution), variant, corners, solution))
     _, variant, corners, solution = min(trials, key=lambda trial: trial[0])
     pixels, again = _find_outliers_again(views.files, corners, solution, board)
@@ -123,7 +123,7 @@ def calibrate_corners(
     names = [f"board {i}" for i in range(len(pixels))] if names is None else list(names)
     names, corners, rejected = _gather(pixels, points, size, names)
     fits = _fits(corners, model, order, simple)
-    misfit = _misfitting(corners, next(iter(fits.values())))
+    misfit = _misfitting(corners, _last(fits))
     if misfit:
         share = "half of its corners are outliers: another board, or corners in a wrong order"
         rejected += [(names[b], share) for b in misfit]
@@ -134,7 +134,7 @@ def calibrate_corners(
     order, scores = _choose(corners, fits, model, order, simple)
     solution = fits[order]
     camera = _camera(solution, corners, model, mirror, lens)
-    cover = coverage(camera, corners, np.linalg.norm(solution.translation, axis=1))
+    cover = coverage(camera, corners, _distances(corners, solution))
     uncertain = bearings(camera, cover.radius)
     told = warnings(corners, names, cover, uncertain)
     _refuse(cover, uncertain, told)
@@ -174,13 +174,14 @@ def held_out(corners, fits, model, order=None, simple=False, folds=2):
 
 def _choose(corners, fits, model, order, simple):
     """The order to take and {order: RMS px on boards left out}, outliers left aside."""
-    if model == "unified" or order or corners.boards < 2 * LEAST_BOARDS:
-        return order if order in fits else next(iter(fits)), {}
-    good = next(iter(fits.values())).weight > 0
-    left = held_out(corners, fits, model, simple=simple)
+    taken = list(fits)[-1] if order or model == "unified" else next(iter(fits))
+    if corners.boards < 2 * LEAST_BOARDS:
+        return taken, {}
+    good = _last(fits).weight > 0
+    left = held_out(corners, fits, model, order, simple)
     scores = {key: math.sqrt(np.mean(d[good] ** 2)) for key, d in left.items()}
-    near = [key for key in fits if scores[key] < TIE * min(scores.values())]
-    return near[0], scores
+    near = [key for key in fits if scores[key] <= TIE * min(scores.values())]
+    return (taken if order else near[0]), scores
 
 
 def _gather(pixels, points, size, names):
@@ -275,6 +276,18 @@ def _without_outliers(model, corners, solution):
 
 def _inlier_rms(solution):
     return math.sqrt(np.mean(solution.distance[solution.weight > 0] ** 2))
+
+
+def _last(fits):
+    """The `Solution` of the highest order."""
+    return list(fits.values())[-1]
+
+
+def _distances(corners, solution):
+    """Distance [B] m of the boards, of the middle of what is seen of each."""
+    middle = [corners.point[corners.board == b].mean(0) for b in range(corners.boards)]
+    arm = np.einsum("bij,bj->bi", solution.rotation[..., :2], middle)
+    return np.linalg.norm(arm + solution.translation, axis=1)
 
 
 def _misfitting(corners, solution):

@@ -27,8 +27,7 @@ def text(found):
         *_coverage(found.coverage),
         "",
     ]
-    if len(found.scores) > 1:
-        lines += _orders(found) + [""]
+    lines += [*_orders(found), ""]
     low, high = np.degrees(camera.elevation)
     lines += [
         f"bearing uncertainty (1 sigma): {found.bearings.rms_deg:.3f}° RMS,"
@@ -57,9 +56,10 @@ def _rejected(found):
 
 
 def _orders(found):
-    lines = ["order  RMS [px]  on boards left out"]
+    lines = ["order    RMS [px]  on boards left out"]
     for order, (rms, left_out) in found.scores.items():
-        lines.append(f"{order:5}  {rms:8.4f}  {left_out:8.4f}{' <' * (order == found.order)}")
+        told = f"{left_out:.4f}" if np.isfinite(left_out) else "too few boards"
+        lines.append(f"{order:7}  {rms:8.4f}  {told}{' <' * (order == found.order)}")
     return lines
 
 
