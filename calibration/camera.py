@@ -165,9 +165,11 @@ def held_out(corners, fits, model, order=None, simple=False, folds=2):
         out = np.arange(corners.boards) % folds == fold
         inside, outside = corners.of_boards(np.flatnonzero(~out)), np.flatnonzero(out)
         outer = corners.of_boards(outside)
-        for key, fit in _fits(inside, model, order, simple).items():
-            poses = fits[key].rotation[outside], fits[key].translation[outside]
-            rest = adjust(model, outer, Solution(fit.params, *poses), freedom(model, ()))
+        cameras = _fits(inside, model, order, simple)
+        for key, fit in fits.items():
+            poses = fit.rotation[outside], fit.translation[outside]
+            start = Solution(cameras[key].params, *poses)
+            rest = adjust(model, outer, start, freedom(model, ()))
             length[key][out[corners.board]] = rest.distance
     return length
 
