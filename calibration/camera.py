@@ -20,7 +20,6 @@ from jaxslam.vision.camera import Camera, parameter_names
 
 LEAST_BOARDS, LEAST_CORNERS = 3, 8
 ORDERS = (4, 5, 6)
-TIE = 1.01  # a lower order is taken if its held-out RMS is within this factor of the best
 WORST = 1.0  # deg: a calibration whose bearings are less sure than that is refused
 START = ("a0", "a2", "cx", "cy"), ("a3", "a4"), ("c", "e", "p1", "p2")
 NOT_SIMPLE = {"polynomial": ("p1", "p2"), "unified": ("s",)}
@@ -182,8 +181,7 @@ def _choose(corners, fits, model, order, simple):
     good = _last(fits).weight > 0
     left = held_out(corners, fits, model, order, simple)
     scores = {key: math.sqrt(np.mean(d[good] ** 2)) for key, d in left.items()}
-    near = [key for key in fits if scores[key] <= TIE * min(scores.values())]
-    return (taken if order else near[0]), scores
+    return (taken if order else min(scores, key=scores.get)), scores
 
 
 def _gather(pixels, points, size, names):
