@@ -199,13 +199,13 @@ def test_points_of_a_log_lie_in_their_ellipses():
         e = errors(found)
         given = np.isfinite(e[:, 0])
         assert given.sum() > 300
-        assert np.median(np.hypot(*e[given].T)) < 0.1
+        assert np.median(np.hypot(*e[given].T)) < 0.14
         inside = square(e[given], found.point_cov[given]) < 5.991
         assert (0.88 if known else 0.82) < inside.mean() < 0.99
         counts = {k: v for k, v in found.skipped.items() if "without a point" in k}
         assert sum(counts.values()) == (~given).sum()
         assert all(k.startswith("not used: ") for k in counts)
-    assert np.nanmin(found.point_baseline) >= 0.8 - 1e-9
+    assert np.nanmin(found.point_baseline) >= 0.4 - 1e-9
     assert found.has("position")
 
 
@@ -214,11 +214,8 @@ def test_a_log_with_points_is_kept_by_its_file(tmp_path):
     save_log(tmp_path / "a.npz", found)
     again = load_log(tmp_path / "a.npz")
     np.testing.assert_array_equal(found.point, again.point)
-    assert (
-        again.noise["position_scale"]
-        == found.noise["position_scale"]
-        == pytest.approx(4.0, rel=0.15)
-    )
+    assert again.noise == found.noise
+    assert 4 * np.sqrt(2) <= found.noise["position_scale"] <= 4 * np.sqrt(3.1)  # 2 or 3 frames back
     # Doing it again changes nothing: what was counted is not counted twice.
     assert triangulate_log(again).skipped == again.skipped
 
@@ -271,7 +268,8 @@ def test_a_false_match_is_found_by_what_lies_between():
     log = drive(detection=1.0, view=(-np.pi, np.pi, 1e3), length_m=4.0)
     wrong = (log.identity == 3) & (log.frame == 10)
     bearing = np.where(wrong, log.bearing + 0.2, log.bearing)
-    found = triangulate_log(replace(log, bearing=bearing), use_identity=True)
+    settings = PointSettings(baseline=0.75)
+    found = triangulate_log(replace(log, bearing=bearing), None, settings, use_identity=True)
     why = "not used: bearing without a point: the line was elsewhere in between (a false match)"
     assert found.skipped.get(why, 0) >= 1
     spoilt = np.isfinite(found.point[:, 0]) & (log.identity == 3) & (log.frame == 12)

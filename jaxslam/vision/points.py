@@ -51,10 +51,10 @@ class PointSettings:
     experiments/points.py.
     """
 
-    baseline: float = 0.8
+    baseline: float = 0.4
     longest: float = 2.0
     pairs: str = "overlapping"
-    inflation: float = 4.0
+    inflation: float = 16.0
     memory: int = 3
     sigma: float | None = None
     matching: MatchSettings = field(default_factory=MatchSettings)
