@@ -47,8 +47,8 @@ class PointSettings:
     Points over the same stretch of road share its error, one line's and all lines' alike, and a
     filter that takes them as independent grows too sure. A point's covariance stays its own; the
     log declares a `position_scale` for the filter: the root of `inflation` times the number of
-    points of a line that overlap. To inflate all points was better than to thin them out: see
-    experiments/points.py.
+    points of a line that overlap. Inflating all mapped 80 % of a simulated room's landmarks where
+    thinning to disjoint pairs left 11 %, with paths as good (experiments/points.py).
     """
 
     baseline: float = 0.4
