@@ -6,6 +6,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from calibration.odometry import ODOMETRY
 from calibration.points import Model, PointErrors, compare, identified, point_errors
 from calibration.sensor import ErrorModel, fit
 from jaxslam.config import UNITS, Params
@@ -49,6 +50,19 @@ def values(report):
         if model.name == "propagated normal":
             found["position_scale"] = model.values["position_scale"]
     return {k: v for k, v in found.items() if k in Params._fields}, errors
+
+
+def for_filter(report, base):
+    """`Params` for a run, from those it would have without: the motion, and how sharp points are.
+
+    Bearings keep what `base` says: with noise as small as the lines' own, the few particles that
+    the motion happens to draw nearby would take all the weight. `position_scale` multiplies the
+    base's for the same reason.
+    """
+    found, _ = values(report)
+    motion = {k: found[k] for k in ODOMETRY if k in found}
+    scale = base.position_scale * found.get("position_scale", 1.0)
+    return base._replace(**motion, position_scale=scale)
 
 
 def text(report):

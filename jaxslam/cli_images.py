@@ -12,9 +12,14 @@ calibrate = App(name="calibrate", help="Fit a camera, its tilt, or a sensor's er
 Source = option(Path, "a folder of images, one image, or a video")
 CameraFile = option(Path, "the camera: .toml, calib_results.txt of OCamCalib, or .yaml")
 Camera = option(Path, "where the camera is written, a .toml file")
+Motion = option(Path, "parameters of the robot's motion, from calibrate sensor") | None
+Overlay = option(Path, "folder, .mp4 or .avi for the images with their lines drawn in") | None
+Truth = option(Path, "folder of poses.csv, landmarks.csv and plan.csv, where known") | None
 Models = Literal["polynomial", "unified"]
-LensSide = option(Literal["up", "down"], "where the lens points on the robot (a .toml says it itself)")
-Mirror = option(bool, "seen by one mirror, which turns the sense of up (a .toml says it itself)")
+LensSide = option(
+    Literal["up", "down"], "where the lens points on the robot (a .toml says it itself)"
+)
+Mirror = option(bool, "seen by one mirror, which turns what is up (a .toml says it itself)")
 Drives = Literal["loop", "straight", "turn"]
 Presets = Literal["clean", "normal", "hard"]
 Pairs = Literal["consecutive", "disjoint"]
@@ -130,10 +135,13 @@ def sensor(
     with bar("fitting"):
         report = sensor_report.calibrate_sensor(drive)
     print(sensor_report.text(report))
-    found, errors = sensor_report.values(report)
     base = default_params("position" if report.models else "bearing", drive)
-    save_params(out, base._replace(**found), errors)
-    print(f"{out}: for jaxslam run --params")
+    params = sensor_report.for_filter(report, base)
+    errors = sensor_report.values(report)[1]
+    save_params(
+        out, params, {k: v for k, v in errors.items() if getattr(base, k) != getattr(params, k)}
+    )
+    print(f"{out}: the motion, and the points' scale, for --params of extract and run")
     if figure:
         print(f"{sensor_report.draw(report, drive, figure)}: points, ellipses, surveyed lines")
 
@@ -147,9 +155,9 @@ def extract(
     lens: LensSide = "up",
     odometry: option(Path, ".csv: time_s,distance_m,turn_rad or time_s,forward_m_s,yaw_rate_rad_s"),
     out: OutLog,
-    truth: option(Path, "folder of poses.csv, landmarks.csv and plan.csv, where known")
-    | None = None,
-    overlay: option(Path, "folder for pictures with the lines drawn in") | None = None,
+    truth: Truth = None,
+    params: Motion = None,
+    overlay: Overlay = None,
     overwrite: Overwrite = False,
 ):
     """Make a log of images: vertical lines, matched and triangulated, with the odometry.
@@ -160,7 +168,9 @@ def extract(
 
     Example: jaxslam extract images/ --camera camera.toml --odometry odometry.csv --out OUT.npz
     """
+    from jaxslam.config import default_params
     from jaxslam.log import NOT_USED
+    from jaxslam.paramfile import load_params
     from jaxslam.vision.camera_files import load_camera
     from jaxslam.vision.extract import extract as run_extract
 
@@ -172,6 +182,7 @@ def extract(
             odometry,
             out,
             truth=truth,
+            params=load_params(params, default_params("position")) if params else None,
             overlay=overlay,
             overwrite=overwrite,
             progress=progress,
@@ -183,19 +194,25 @@ def extract(
     return int(bool(lost))
 
 
-def triangulate(log: LogName, out: OutLog, /, *, overwrite: Overwrite = False):
+def triangulate(
+    log: LogName, out: OutLog, /, *, params: Motion = None, overwrite: Overwrite = False
+):
     """Add points to a log of bearings: matched between frames, triangulated by odometry.
 
     The paper's way on any log; jaxslam run --sensor position then uses the points.
 
     Example: jaxslam triangulate lost-in-the-woods OUT.npz
     """
+    from jaxslam.config import default_params
     from jaxslam.log import load_log, save_log
+    from jaxslam.paramfile import load_params
     from jaxslam.vision.points import triangulate_log
 
     check_new(out, overwrite)
     with bar("triangulating") as progress:
-        found = triangulate_log(load_log(log), progress=progress)
+        given = load_log(log)
+        robot = load_params(params, default_params("position", given)) if params else None
+        found = triangulate_log(given, robot, progress=progress)
     save_log(out, found)
     print(f"{out}: {found}; map it with: jaxslam run {out} --sensor position")
 

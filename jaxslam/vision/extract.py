@@ -21,6 +21,7 @@ from jaxslam.vision.partial import Partial
 from jaxslam.vision.points import triangulate_log
 from jaxslam.vision.times import NO_TIME, image_times
 
+DETECTION = 0.5  # declared: what stands in a room hides what is behind it, half of the time
 REACH = 10.0  # m, declared as what the camera can see
 PLAN = ["x1_m", "y1_m", "x2_m", "y2_m"]
 MOTION = ("err_tran", "err_rot", "err_drift", "floor_tran", "floor_rot", "gain_tran", "gain_rot")
@@ -73,7 +74,7 @@ def extract(
     log = _with_truth(log, truth)
     if params is not None:  # the filter must believe of the motion what the points were made with
         noise = {name: float(getattr(params, name)) for name in MOTION}
-        log = replace(log, noise=noise)
+        log = replace(log, noise=log.noise | noise)
         params = params._replace(mount_x=log.mounting[0], mount_y=log.mounting[1], mount_yaw=0.0)
     log = triangulate_log(log, params, points)
     if out is not None:
@@ -216,6 +217,7 @@ def _log(rows, time, kind, odometry, camera, reach, skipped, name):
         descriptor=np.column_stack([lines.low, lines.high, lines.polarity, colour]),
         view=(-np.pi, np.pi, reach),
         mounting=(*camera.position[:2], 0.0),  # bearings are in the robot's heading already
+        noise={"detection": DETECTION},
         skipped=skipped,
     )
     return log

@@ -1,0 +1,28 @@
+"""Which line is which edge: extracted lines beside the edges that the room's geometry shows."""
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from jaxslam.evaluate import wrap
+from jaxslam.room import visible_edges
+
+PAIR = np.radians(1.0)  # a line and an edge farther apart are not one another
+FALSE = np.radians(0.5)  # a line farther than that from every visible edge is false
+CONTRAST = 0.08  # of 1, between the two sides of an edge, for it to count in the recall
+TALL = np.radians(10)  # of an edge in view
+
+
+def named(bearing, world, pose):
+    """Of lines [n]: the edge's id (-1: none), the error [rad], whether it is false; and the ids of
+    the edges that ought to be found."""
+    seen = visible_edges(world, pose)
+    apart = wrap(bearing[:, None] - seen.bearing)
+    identity, error = np.full(len(bearing), -1), np.full(len(bearing), np.nan)
+    if apart.size:
+        rows, columns = linear_sum_assignment(np.minimum(np.abs(apart), PAIR))
+        near = np.abs(apart[rows, columns]) < PAIR
+        rows, columns = rows[near], columns[near]
+        identity[rows], error[rows] = seen.id[columns], apart[rows, columns]
+    false = np.abs(apart).min(axis=1, initial=np.inf) > FALSE
+    clear = (seen.contrast >= CONTRAST) & (seen.high - seen.low >= TALL)
+    return identity, error, false, seen.id[clear & world.edges.landmark[seen.id]]
