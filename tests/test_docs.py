@@ -10,7 +10,7 @@ import pytest
 from jaxslam.config import Config, Params
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("docs/equations.md", "docs/algorithm.md")
+PAGES = ("docs/equations.md", "docs/algorithm.md", "docs/images.md")
 REFERENCE = re.compile(r"`([\w./-]+\.py):([\w.]+)`")
 
 
