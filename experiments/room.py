@@ -1,13 +1,14 @@
 """The paper's experiment on rendered images: round the room and back, both sensors, from images.
 
     python experiments/room.py                  three rooms, tables and figure (about 15 minutes)
-    python experiments/room.py --ablation       what each part is worth, on the same rooms
+    python experiments/room.py --ablation       what each part is worth, and each error model
     python experiments/room.py --seeds 101      one room
 
 A straight calibration drive in another room gives the sensor's errors, as in the paper; then every
 room is driven round three times (60 m, an image every 20 cm), its lines are extracted and matched,
 and the log is filtered with identities hidden. Nothing is aligned: the start pose is given, as the
-paper reads its errors off the floor's tiles. Writes experiments/results/room.md and docs/room.png.
+paper reads its errors off the floor's tiles. Writes experiments/results/room.md and docs/room.png,
+points.png and lines.png.
 """
 
 import argparse
@@ -15,27 +16,30 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+from line_truth import CONTRAST, TALL, named
 
 from calibration import sensor_report
+from calibration.points import with_model
 from jaxslam import config_for, default_params, run
 from jaxslam.evaluate import pair_by_distance, truth_at
 from jaxslam.furnish import furnish
 from jaxslam.render import double_mirror_camera, nominal, render_room
 from jaxslam.room import visible_edges
-from jaxslam.vision.camera import Camera
 from jaxslam.vision.camera_files import load_camera
 from jaxslam.vision.extract import extract
-from jaxslam.vision.lines import LineSettings
+from jaxslam.vision.images import read_image
+from jaxslam.vision.lines import LineSettings, extract_lines
 from jaxslam.vision.matching import MatchSettings
+from jaxslam.vision.overlay import draw_lines, draw_on_image
+from jaxslam.vision.panorama import panorama, unwrap
 from jaxslam.vision.points import PointSettings
 
 RESULTS = Path(__file__).parent / "results"
 FIGURE = Path(__file__).parents[1] / "docs" / "room.png"
 CALIBRATION = 100  # seed of the room of the straight drive
 GATE = 0.15  # m, within which an edge counts as mapped
-CONTRAST = 0.08  # of 1, between the two sides of an edge
-TALL = np.radians(10)  # of an edge in view
 MOTION = ("gain_tran", "gain_rot", "err_tran", "err_rot", "err_drift")
 OFTEN = 0.1  # of the frames in which a visible edge is in view
 
@@ -182,49 +186,127 @@ def draw(result, seed, path):
         write_figure(figure, path)
 
 
-def cameras(camera):
-    """Name -> camera, line settings and matching's colours, of the ablation."""
+def draw_lines_found(place, camera, path):
+    """An image of the drive and its panorama, with the lines drawn in, one above the other."""
+    image = read_image(place / "images" / "000010.png")
+    lines, view = extract_lines(image, camera), panorama(camera)
+    strip = draw_lines(unwrap(image, view), lines, view)
+    pair = np.hstack([image, draw_on_image(image, lines, camera)])
+    wide, tall = strip.shape[1], round(pair.shape[0] * strip.shape[1] / pair.shape[1])
+    both = np.vstack([cv2.resize(pair, (wide, tall), interpolation=cv2.INTER_AREA), strip])
+    both = cv2.resize(both, None, fx=0.7, fy=0.7, interpolation=cv2.INTER_AREA)
+    if not cv2.imwrite(str(path), both):
+        raise ValueError(f"{path}: can't be written")
+
+
+def ablated(camera):
+    """Name -> camera and settings of the extraction, one part left out each."""
     flat = nominal(camera)
-    uncalibrated = Camera(**{**vars(flat), "roll": camera.roll, "pitch": camera.pitch})
-    level = Camera(**{**vars(camera), "roll": 0.0, "pitch": 0.0})
     blind = PointSettings(matching=MatchSettings(use_colour=False))
     return {
         "all parts": (camera, {}),
-        "calibration off": (uncalibrated, {}),
-        "tilt off": (level, {}),
+        "calibration off": (replace(flat, roll=camera.roll, pitch=camera.pitch), {}),
+        "tilt off": (replace(camera, roll=0.0, pitch=0.0), {}),
         "colour off": (camera, {"lines": LineSettings(colour=False), "points": blind}),
         "merging off": (camera, {"lines": LineSettings(merge=False)}),
     }
 
 
+def one_best(log):
+    """The log with the surest point of every frame alone, as with one measurement per step."""
+    size = np.where(np.isfinite(log.point_cov[:, 0]), log.point_cov[:, [0, 2]].sum(1), np.inf)
+    best = [rows[np.argmin(size[rows])] for rows in _rows_of_frames(log) if len(rows)]
+    kept = np.isin(np.arange(len(size)), best)[:, None] & np.isfinite(size)[:, None]
+    base = np.where(kept[:, 0], log.point_baseline, np.nan)
+    return replace(log, point=np.where(kept, log.point, np.nan), point_baseline=base,
+                   point_cov=np.where(kept, log.point_cov, np.nan))  # fmt: skip
+
+
+def _rows_of_frames(log):
+    return np.split(np.arange(len(log.frame)), np.flatnonzero(np.diff(log.frame)) + 1)
+
+
+def line_scores(log, seed):
+    """RMS error of the lines' bearings [deg], and false lines a frame, of every fifth frame."""
+    world, poses = furnish(seed), truth_at(log.truth, log.frame_time)
+    errors, false, frames = [], 0, 0
+    for k in range(0, len(poses), 5):
+        _, error, wrong, _ = named(log.bearing[log.frame == k], world, poses[k])
+        errors.append(error[np.isfinite(error)])
+        false, frames = false + wrong.sum(), frames + 1
+    return np.degrees(np.sqrt(np.mean(np.concatenate(errors) ** 2))), false / frames
+
+
+def ablation(folder, camera, found, seed, particles, preset):
+    """Markdown: what the lines and the path lose without each part."""
+    place = rendered(folder, seed, "loop", preset)
+    lines = ["| room " + str(seed) + " | bearing, RMS | false lines a frame | path RMSE [m] "
+             "| path, most [m] | mapped | spurious |", "|---" * 7 + "|"]  # fmt: skip
+    logs = {name: extracted(place, eye, found, **settings)
+            for name, (eye, settings) in ablated(camera).items()}  # fmt: skip
+    logs["one measurement per step"] = one_best(logs["all parts"])
+    for name, log in logs.items():
+        error, false = line_scores(log, seed)
+        got = score(filtered(log, "position", particles, seed), seed, log)
+        cells = f"{error:.3f}° | {false:.2f} | {got['path_m']:.3f} | {got['path_max_m']:.2f}"
+        mapped = f"{got['mapped']} of {got['edges']}"
+        lines.append(f"| {name} | {cells} | {mapped} | {got['spurious']} |")
+        print(lines[-1], flush=True)
+    return "\n".join(lines)
+
+
+def models_in_the_filter(report, log, seed, particles):
+    """Markdown: the candidates for a point's error, by held-out density and through the filter."""
+    lines = ["| error model of a point | nats per held-out point | in 95 % | path RMSE [m] "
+             "| landmarks RMSE [m] | mapped | spurious |", "|---" * 7 + "|"]  # fmt: skip
+    for model in report.models:
+        got = score(filtered(with_model(model, log), "position", particles, seed), seed, log)
+        told = f"{model.held_out:.2f} | {100 * model.coverage:.0f} %"
+        cells = f"{got['path_m']:.3f} | {got['landmarks_m']:.3f} | {got['mapped']}"
+        lines.append(f"| {model.name} | {told} | {cells} | {got['spurious']} |")
+        print(lines[-1], flush=True)
+    return "\n".join(lines)
+
+
 def main():
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--seeds", type=int, nargs="+", default=[101, 102, 103])
+    options.add_argument("--draws", type=int, nargs="+", default=[0, 1, 2], help="filter's seeds")
     options.add_argument("--particles", type=int, default=1000)
     options.add_argument("--preset", default="normal")
     options.add_argument("--folder", type=Path, default=Path("runs/rooms"))
-    options.add_argument("--sensors", nargs="+", default=["position", "bearing"])
+    options.add_argument("--ablation", action="store_true")
     options = options.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
-    camera = double_mirror_camera()
-    found, report, _ = calibrated(options.folder, camera, options.preset)
-    print(sensor_report.text(report))
-    rows, results = [], {}
-    for sensor in options.sensors:
-        for seed in options.seeds:
-            place = rendered(options.folder, seed, "loop", options.preset)
-            log = extracted(place, load_camera(place / "camera.toml"), found)
-            result = filtered(log, sensor, options.particles, seed)
-            rows.append((f"{sensor}, room {seed}", score(result, seed, log)))
-            results[sensor, seed] = result
-            print(table(rows[-1:]).splitlines()[-1], flush=True)
-    text = table(rows)
-    print(text)
     RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "room.md").write_text(text + "\n")
+    camera = double_mirror_camera()
+    found, report, straight = calibrated(options.folder, camera, options.preset)
+    print(sensor_report.text(report))
+    first = options.seeds[0]
+    if options.ablation:
+        parts = ablation(options.folder, camera, found, first, options.particles, options.preset)
+        place = rendered(options.folder, first, "loop", options.preset)
+        log = extracted(place, camera, found)
+        models = models_in_the_filter(report, log, first, options.particles)
+        (RESULTS / "room-ablation.md").write_text(parts + "\n\n" + models + "\n")
+        return
+    sensor_report.draw(report, straight, FIGURE.with_name("points.png"))
+    rows = []
+    for seed in options.seeds:
+        place = rendered(options.folder, seed, "loop", options.preset)
+        log = extracted(place, load_camera(place / "camera.toml"), found)
+        if seed == first:
+            draw_lines_found(place, camera, FIGURE.with_name("lines.png"))
+        runs = [("position", draws) for draws in options.draws] + [("bearing", options.draws[0])]
+        for sensor, draws in runs:
+            result = filtered(log, sensor, options.particles, draws)
+            rows.append((f"{sensor}, room {seed}, run {draws}", score(result, seed, log)))
+            print(table(rows[-1:]).splitlines()[-1], flush=True)
+            if (sensor, seed, draws) == ("position", first, options.draws[0]):
+                draw(result, seed, FIGURE)
+    rows.sort(key=lambda row: row[0].startswith("bearing"))
+    (RESULTS / "room.md").write_text(table(rows) + "\n")
     (RESULTS / "room.json").write_text(json.dumps(dict(rows), indent=1) + "\n")
-    if ("position", options.seeds[0]) in results:
-        draw(results["position", options.seeds[0]], options.seeds[0], FIGURE)
 
 
 if __name__ == "__main__":
