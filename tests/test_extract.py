@@ -304,4 +304,4 @@ def test_the_camera_says_where_it_sits(room, monkeypatch):
     log = extract(room / "images", moved, room / "odometry.csv", reach=7.0)
     assert log.mounting == (0.2, -0.1, 0.0)
     assert log.view[2] == 7.0
-    assert set(log.noise) == {"position_scale"}
+    assert set(log.noise) == {"position_scale", "detection"}

@@ -109,8 +109,8 @@ def test_an_image_smaller_than_its_header_says_is_refused(tmp_path):
 
 
 def test_folders_and_missing_files_are_no_images(tmp_path):
-    for path in (tmp_path, tmp_path / "absent.png"):
-        with pytest.raises(ValueError, match="no such file"):
+    for path, told in ((tmp_path, "is a folder"), (tmp_path / "absent.png", "no such file")):
+        with pytest.raises(ValueError, match=told):
             read_image(path)
 
 

@@ -98,7 +98,7 @@ def read_csv(paths, view=None, mounting=(0.0, 0.0, 0.0)):
 
 def read_odometry(path, skipped):
     """Kind ("velocity" or "command") and `Table` in order of time; counts bad rows in `skipped`."""
-    name, file = _opened(Path(path))
+    name, file = _opened(Path(path), ["odometry"])
     if name != "odometry":
         header = " or ".join(",".join(layout) for layout in LAYOUTS["odometry"])
         raise ValueError(f"{path}: is a {name} file; odometry has the header {header}")
@@ -111,21 +111,21 @@ def read_truth(paths, skipped):
     """`Truth` of a file of poses, one of landmarks, or both; None of neither."""
     files = {}
     for path in map(Path, paths):
-        name, file = _opened(path)
+        name, file = _opened(path, ["truth", "landmarks"])
         if name not in ("truth", "landmarks") or name in files:
             raise ValueError(f"{path}: is a {name} file; one of truth and one of landmarks may be")
         files[name] = file
     return _truth(files, skipped)
 
 
-def _opened(path):
+def _opened(path, wanted=LAYOUTS):
     """Kind of a file by its header; its path, columns, lines and completeness."""
     lines, complete = read_lines(path, ",")
     header = tuple(cell.strip('"').lower() for cell in lines[0][1])
     kinds = [kind for kind, layouts in LAYOUTS.items() if header in layouts]
     if not kinds:
         found = ",".join(header)[:80]
-        allowed = " or ".join(",".join(row) for rows in LAYOUTS.values() for row in rows)
+        allowed = " or ".join(",".join(row) for kind in wanted for row in LAYOUTS[kind])
         place = f"{path}, line {lines[0][0]}"
         raise ValueError(f"{place}: {found!r} is no known header; allowed: {allowed}")
     return kinds[0], (path, header, lines[1:], complete)

@@ -23,6 +23,7 @@ from jaxslam.vision.camera_formats import (
 MAX_BYTES = 1 << 20
 FORMATS = ("toml", "ocamcalib", "kalibr", "opencv")
 BY_SUFFIX = {".toml": "toml", ".txt": "ocamcalib", ".yaml": "opencv", ".yml": "opencv"}
+ENDINGS = f"a camera file ends in one of {', '.join(BY_SUFFIX)}"
 
 
 def save_camera(path, camera, kind=None):
@@ -33,7 +34,7 @@ def save_camera(path, camera, kind=None):
     path = Path(path)
     kind = kind or BY_SUFFIX.get(path.suffix.lower())
     if kind not in FORMATS:
-        raise ValueError(f"{path}: ends in none of {', '.join(BY_SUFFIX)}")
+        raise ValueError(f"{path}: {ENDINGS}")
     writers = dict(zip(FORMATS, (_to_toml, to_ocamcalib, to_kalibr, to_opencv), strict=True))
     try:
         text = writers[kind](camera)
@@ -60,7 +61,7 @@ def load_camera(path, mirror=False, lens="up"):
     path = Path(path)
     kind = BY_SUFFIX.get(path.suffix.lower())
     if kind is None:
-        raise ValueError(f"{path}: ends in none of {', '.join(BY_SUFFIX)}")
+        raise ValueError(f"{path}: {ENDINGS}")
     text = _text(path)
     try:
         if kind == "toml":

@@ -58,20 +58,25 @@ def extract(
     interrupted.
     """
     _check_out(out, overwrite)
+    partial = None if out is None else Path(out).with_name(f".{Path(out).name}.partial")
     skipped = {}
     lines = LineSettings() if lines is None else lines
     images = Images(source)
+    _check_overlay(overlay, images, overwrite or (partial is not None and partial.exists()))
     kind, table = read_odometry(odometry, skipped)
     time, origin = image_times(images, (kind, table.time), times)
     kept = _in_time(images, time, kind, table.time, skipped)
     if len(kept) == 0:
-        raise ValueError(f"{images.names[0]}: no image has odometry; times are from {origin}")
-    partial = None if out is None else Path(out).with_name(f".{Path(out).name}.partial")
+        between = f"{origin}, {_span(time[time != NO_TIME])}; {odometry} has {_span(table.time)}"
+        raise ValueError(f"{images.names[0]}: no image has odometry; times are from {between}")
+    known = _read_known(truth, skipped)
     settings = _settings(images, time, kept, camera, lines)
     with Partial(partial, settings) as done:
         _look(images, kept, camera, lines, done, overlay, progress)
-        log = _log(done.rows, time[kept], kind, table, camera, reach, skipped, _name(source, out))
-    log = _with_truth(log, truth)
+    if all(isinstance(found, str) for _, found in done.rows):
+        done.remove()  # nothing in it is worth going on from
+    log = _log(done.rows, time[kept], kind, table, camera, reach, skipped, _name(source, out))
+    log = _with_truth(log, *known)
     if params is not None:  # the filter must believe of the motion what the points were made with
         noise = {name: float(getattr(params, name)) for name in MOTION}
         log = replace(log, noise=log.noise | noise)
@@ -91,6 +96,23 @@ def _check_out(out, overwrite):
         raise ValueError(f"{out}: a log is a .npz file; name it {out.name}.npz")
     if out.exists() and not overwrite:
         raise ValueError(f"{out}: exists; choose another name, or overwrite it")
+
+
+def _check_overlay(target, images, replace):
+    """Refuse what would replace the images themselves, or drawings of another run."""
+    if target is None:
+        return
+    target = Path(target)
+    theirs = [images.video] if images.video else {Path(file).parent for file in images.files}
+    if any(target.resolve() == place.resolve() for place in theirs):
+        raise ValueError(f"{target}: the images themselves are there; choose another for drawings")
+    taken = any(target.iterdir()) if target.is_dir() else target.exists()
+    if taken and not replace:
+        raise ValueError(f"{target}: exists; choose another name or add --overwrite")
+
+
+def _span(stamps):
+    return f"{stamps.min() / 1e9:.1f} to {stamps.max() / 1e9:.1f} s"
 
 
 def _name(source, out):
@@ -223,22 +245,26 @@ def _log(rows, time, kind, odometry, camera, reach, skipped, name):
     return log
 
 
-def _with_truth(log, folder):
-    """The log with the truth and the plan in a folder, and the start pose of that truth."""
-    motion = increments(log)
-    still = (motion.distance[1:] == 0) & (motion.turn[1:] == 0)
-    skipped = dict(log.skipped)
-    _count(skipped, f"{NOT_USED}image without motion since the one before (a frame all the same)",
-           still.sum())  # fmt: skip
-    log = replace(log, skipped=skipped)
+def _read_known(folder, skipped):
+    """`Truth` and `FloorPlan` in a folder, None where it has none; counts bad rows in `skipped`."""
     if folder is None:
-        return log
+        return None, None
     folder = Path(folder)
     files = [folder / name for name in ("poses.csv", "landmarks.csv")]
     truth = read_truth([file for file in files if file.is_file()], skipped)
     plan = read_plan(folder / "plan.csv") if (folder / "plan.csv").is_file() else None
     if truth is None and plan is None:
         raise ValueError(f"{folder}: has none of poses.csv, landmarks.csv and plan.csv")
+    return truth, plan
+
+
+def _with_truth(log, truth, plan):
+    """The log with what is known of the truth, and the start pose of it."""
+    motion = increments(log)
+    still = (motion.distance[1:] == 0) & (motion.turn[1:] == 0)
+    skipped = dict(log.skipped)
+    _count(skipped, f"{NOT_USED}image without motion since the one before (a frame all the same)",
+           still.sum())  # fmt: skip
     start = None
     if truth is not None and truth.time is not None:
         start = pose_at(max(log.start, int(truth.time[0])), truth.time, truth.pose)
@@ -268,7 +294,9 @@ class _Overlay:
             try:
                 self.target.mkdir(parents=True, exist_ok=True)
             except OSError as err:
-                raise ValueError(f"{self.target}: cannot be made ({err.strerror})") from None
+                raise ValueError(
+                    f"{self.target}: cannot be made ({err.strerror}); give a folder, .mp4 or .avi"
+                ) from None
         return self
 
     def __exit__(self, *_):
@@ -283,7 +311,7 @@ class _Overlay:
                 size = picture.shape[1::-1]
                 self.video = cv2.VideoWriter(str(self.target), code, VIDEO_RATE, size)
                 if not self.video.isOpened():
-                    raise ValueError(f"{self.target}: can't be written as a video")
+                    raise ValueError(f"{self.target}: can't be written as a video; try a folder")
             self.video.write(picture)
             return
         path = self.target / f"{Path(name.replace('#', '-')).stem}.png"

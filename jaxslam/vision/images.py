@@ -160,10 +160,12 @@ def _video_frames(path, names, first):
 def _bytes(path):
     path = Path(path)
     if not path.is_file():
-        raise ValueError(f"{path}: no such file")
+        fault = "is a folder, not an image" if path.is_dir() else "no such file"
+        raise ValueError(f"{path}: {fault}")
     size = path.stat().st_size
     if not 0 < size <= MAX_BYTES:
-        raise ValueError(f"{path}: {size} bytes; an image has 1 to {MAX_BYTES}")
+        found = f"{size} bytes; at most {MAX_BYTES} are read" if size else "is an empty file"
+        raise ValueError(f"{path}: {found}")
     try:
         return path.read_bytes()
     except OSError as error:
