@@ -8,6 +8,7 @@ them for independent, asks for more than that.
 """
 
 import math
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +23,7 @@ LEAST_BOARDS, LEAST_CORNERS = 3, 8
 ORDERS = (4, 5, 6)
 WORST = 1.0  # deg: a calibration whose bearings are less sure than that is refused
 START = ("a0", "a2", "cx", "cy"), ("a3", "a4"), ("c", "e", "p1", "p2")
+UNDETERMINED = "the boards don't determine the camera: place and tilt them differently"
 NOT_SIMPLE = {"polynomial": ("p1", "p2"), "unified": ("s",)}
 
 
@@ -69,6 +71,16 @@ class Calibration:
         ]
 
 
+@contextmanager
+def _determined():
+    """Degenerate boards make some matrix or other singular: say what that means."""
+    try:
+        yield
+    except np.linalg.LinAlgError:
+        raise ValueError(UNDETERMINED) from None
+
+
+@_determined()
 def calibrate_camera(
     source,
     board=(6, 7),
@@ -88,6 +100,7 @@ def calibrate_camera(
     """
     check_board(board, square)
     views = find_views(source, board, progress)
+    _enough(len(views.names), views.rejected)
     points = board_points(board, square)
     given = dict(size=views.size, model=model, mirror=mirror, lens=lens, order=order, simple=simple)
     trials = []
@@ -101,6 +114,7 @@ def calibrate_camera(
     return replace(result, variant=variant, again=again, rejected=views.rejected + result.rejected)
 
 
+@_determined()
 def calibrate_corners(
     pixels,
     points,
@@ -319,7 +333,7 @@ def _camera(solution, corners, model, mirror, lens):
     size = np.sqrt(np.diagonal(information))
     scaled = information / np.outer(size, size)
     if not np.isfinite(scaled).all() or np.linalg.cond(scaled) > 1e13:
-        raise ValueError("the boards don't determine the camera: place and tilt them differently")
+        raise ValueError(UNDETERMINED)
     covariance = variance * np.linalg.inv(scaled) / np.outer(size, size)
     covariance = solution.free @ covariance @ solution.free.T
     count = len(solution.params)

@@ -54,9 +54,10 @@ def find_views(source, board, progress=None):
     """
     if isinstance(source, (list, tuple)) and len(source) == 1:
         source = source[0]
+    place = f"{source[0]} and so on" if isinstance(source, (list, tuple)) else source
     images, seen, rejected = Images(source), [], []
     if images.video:
-        raise ValueError(f"{source}: a video; give single images of the board")
+        raise ValueError(f"{place}: a video; give single images of the board")
     for done, (file, (name, image)) in enumerate(zip(images.files, images, strict=True)):
         if isinstance(image, ValueError):
             rejected.append((name, str(image)))
@@ -66,7 +67,7 @@ def find_views(source, board, progress=None):
         if progress:
             progress(done + 1, len(images))
     if not seen:
-        raise ValueError(f"{source}: no image can be read; the first: {rejected[0][1]}")
+        raise ValueError(f"{place}: no image can be read; the first: {rejected[0][1]}")
     size = Counter(view[2] for view in seen).most_common(1)[0][0]
     no_board = f"no board of {board[0]} x {board[1]} inner corners found"
     for name, _, (width, height), corners in seen:
@@ -78,7 +79,7 @@ def find_views(source, board, progress=None):
     good = [view for view in seen if view[2] == size and view[3] is not None]
     if not good:
         raise ValueError(
-            f"{source}: {no_board} in any of {len(seen)} images; count where four squares meet,"
+            f"{place}: {no_board} in any of {len(seen)} images; count where four squares meet,"
             " not the squares"
         )
     names, files, _, found = map(list, zip(*good, strict=True))

@@ -119,8 +119,12 @@ def warnings(corners, names, cover, uncertain):
     if uncertain.rms_deg > 0.1:
         told.append(f"bearings are known to {uncertain.rms_deg:.2f}° only: take more boards")
     views = [corners.pixel[corners.board == b] for b in range(corners.boards)]
+    twins = []
     for i, view in enumerate(views):
-        for j in range(i):
-            if view.shape == views[j].shape and np.abs(view - views[j]).max() < 0.01:
-                told.append(f"{names[j]} and {names[i]} are the same picture: one counts twice")
+        same = (view.shape == v.shape and np.abs(view - v).max() < 0.01 for v in views[:i])
+        twins += [(j, i) for j, found in enumerate(same) if found][:1]
+    if twins:
+        more = f" ({len(twins) - 1} more are twice there)" if len(twins) > 1 else ""
+        j, i = twins[0]
+        told.append(f"{names[j]} and {names[i]} are the same picture: one counts twice{more}")
     return told

@@ -133,7 +133,7 @@ def _check_change(given, found):
 
 def _look(images, camera, slope, report):
     """`Normals` of each usable image, all names, and the skipped images' reasons with counts."""
-    found, names, skipped = [], [], {}
+    found, names, skipped, first = [], [], {}, {}
     for index, (name, image) in enumerate(images):
         names.append(name)
         try:
@@ -141,12 +141,13 @@ def _look(images, camera, slope, report):
                 raise image
             check_size(image, camera, name)
         except ValueError as error:
-            reason = str(error).removeprefix(f"{name}: ")
+            reason = str(error).split(": ", 1)[-1]  # without the path: alike ones are counted
+            first.setdefault(reason, name)
             skipped[reason] = skipped.get(reason, 0) + 1
         else:
             found.append(_normals(image, camera, slope, index))
         report(index + 1)
-    return found, names, skipped
+    return found, names, {f"{why} (first: {first[why]})": n for why, n in skipped.items()}
 
 
 def _normals(image, camera, slope, index):
@@ -177,7 +178,7 @@ def _joined(found, skipped):
         reasons = "".join(f"; {count} skipped: {reason}" for reason, count in skipped.items())
         raise ValueError(
             f"tilt: {lines} nearly vertical lines in {len(found)} images; at least {LEAST_LINES} "
-            f"are needed{reasons}"
+            f"are needed, of images that are bright and sharp{reasons}"
         )
     return Normals(*(np.concatenate(part) for part in zip(*found, strict=True)))
 
