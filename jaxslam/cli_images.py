@@ -10,16 +10,18 @@ from jaxslam.console import LogName, OutLog, Overwrite, Seed, bar, check_new, op
 calibrate = App(name="calibrate", help="Fit a camera, its tilt, or a sensor's errors.")
 
 Source = option(Path, "a folder of images, one image, or a video")
-CameraFile = option(Path, "the camera: .toml, calib_results.txt of OCamCalib, or .yaml")
+Boards = option(Path, "a folder of images of the board, or the images themselves")
+CameraFile = option(Path, "the camera: .toml, OCamCalib's .txt, or .yaml of Kalibr or OpenCV")
 Camera = option(Path, "where the camera is written, a .toml file")
 Motion = option(Path, "parameters of the robot's motion, from calibrate sensor") | None
 Overlay = option(Path, "folder, .mp4 or .avi for the images with their lines drawn in") | None
 Truth = option(Path, "folder of poses.csv, landmarks.csv and plan.csv, where known") | None
 Models = Literal["polynomial", "unified"]
-LensSide = option(
-    Literal["up", "down"], "where the lens points on the robot (a .toml says it itself)"
-)
-Mirror = option(bool, "seen by one mirror, which turns what is up (a .toml says it itself)")
+Sides = Literal["up", "down"]
+LensSide = option(Sides, "where the lens points on the robot")
+LensOfFile = option(Sides, "where the lens points; not for a .toml, which says it")
+Mirror = option(bool, "the lens looks into one mirror (not for two, which turn the view back)")
+MirrorOfFile = option(bool, "it looks into one mirror; not for a .toml, which says it")
 Drives = Literal["loop", "straight", "turn"]
 Presets = Literal["clean", "normal", "hard"]
 Pairs = Literal["consecutive", "disjoint"]
@@ -27,9 +29,9 @@ Pairs = Literal["consecutive", "disjoint"]
 
 @calibrate.command(usage="Usage: jaxslam calibrate camera [OPTIONS] IMAGES...")
 def camera(
-    *images: Source,
-    board: option(str, "inner corners, as 6x7"),
-    square: option(float, "side of a square [m]"),
+    *images: Boards,
+    board: option(str, "inner corners (where four squares meet), as 6x7"),
+    square: option(float, "side of one square [m]"),
     model: option(Models, "polynomial (Scaramuzza) or unified (Mei) model") = "polynomial",
     mirror: Mirror = False,
     lens: LensSide = "up",
@@ -39,8 +41,9 @@ def camera(
 ):
     """Calibrate a mirror or fisheye camera from images of a chessboard.
 
-    Prints the residuals of every image, what was rejected and why, how the corners
-    cover the view, and the uncertainty of bearings in degrees.
+    Take ten or more: all round the camera, near and far, the board tilted. Prints the
+    residuals of every image, what was rejected and why, how the corners cover the
+    view, and the uncertainty of bearings in degrees.
 
     Example: jaxslam calibrate camera boards/ --board 6x7 --square 0.03 --mirror
     """
@@ -50,8 +53,8 @@ def camera(
 
     if not images:
         raise ValueError("calibrate camera: a folder, or files, of images are needed")
-    for path in (out, report):
-        _check_free(path, overwrite)
+    check_new(out, overwrite, "a camera", ".toml")
+    check_new(report, overwrite, "a picture", ".png")
     with bar("finding corners") as progress:
         found = calibrate_camera(
             list(images) if len(images) > 1 else images[0],
@@ -66,7 +69,7 @@ def camera(
     draw(found, report)
     print(text(found))
     print(f"{out}: the camera; {report}: the fit")
-    return int(bool(found.rejected))
+    return int(bool(found.rejected or found.warnings))
 
 
 @calibrate.command
@@ -75,8 +78,8 @@ def tilt(
     /,
     *,
     camera: CameraFile,
-    mirror: Mirror = False,
-    lens: LensSide = "up",
+    mirror: MirrorOfFile = False,
+    lens: LensOfFile = "up",
     out: Camera | None = None,
     overwrite: Overwrite = False,
 ):
@@ -93,7 +96,7 @@ def tilt(
     from jaxslam.vision.images import Images
 
     if out:
-        _check_free(out, overwrite)
+        check_new(out, overwrite, "a camera", ".toml")
     known = load_camera(camera, mirror, lens)
     with bar("looking for lines") as progress:
         found = find_tilt(Images(images), known, progress=progress)
@@ -102,7 +105,7 @@ def tilt(
         save_camera(out, camera_with_tilt(known, found))
         print(f"{out}: the camera with this tilt")
     for why, count in found.skipped.items():
-        warn(f"{count} images skipped: {why}")
+        warn(f"images skipped, {count}: {why}")
     return int(bool(found.skipped))
 
 
@@ -111,15 +114,17 @@ def sensor(
     log: LogName,
     /,
     *,
-    out: option(Path, "parameter file to write, for run --params") = Path("params.toml"),
+    out: option(Path, "file to write, a .toml, for --params of extract and run") = Path(
+        "params.toml"
+    ),
     figure: option(Path, "picture of points and ellipses (the paper's fig. 6)") | None = None,
     overwrite: Overwrite = False,
 ):
     """Find a sensor's error model from a drive whose truth is known.
 
-    The paper's procedure: drive straight past surveyed lines, look at how bearings
-    and triangulated points lie about them. Says which model of a point's error the
-    data prefer, and by how much, on the half of the drive it was not fitted on.
+    The paper's procedure: drive straight past surveyed lines, 30 stops or more, and
+    extract with --truth. Prints the noise of bearings and motion, and which model of
+    a point's error predicts best, each on the half of the drive it was not fitted on.
 
     Example: jaxslam calibrate sensor straight.npz --out params.toml --figure points.png
     """
@@ -128,10 +133,12 @@ def sensor(
     from jaxslam.log import load_log
     from jaxslam.paramfile import save_params
 
-    for path in (out, figure):
-        if path:
-            _check_free(path, overwrite)
+    check_new(out, overwrite, "a file of parameters", ".toml")
     drive = load_log(log)
+    if figure:
+        check_new(figure, overwrite, "a picture", ".png")
+        if not drive.has("position") or drive.point is None:
+            raise ValueError(f"{log}: has no points to draw; leave --figure out, or triangulate")
     with bar("fitting"):
         report = sensor_report.calibrate_sensor(drive)
     print(sensor_report.text(report))
@@ -151,9 +158,11 @@ def extract(
     /,
     *,
     camera: CameraFile,
-    mirror: Mirror = False,
-    lens: LensSide = "up",
-    odometry: option(Path, ".csv: time_s,distance_m,turn_rad or time_s,forward_m_s,yaw_rate_rad_s"),
+    mirror: MirrorOfFile = False,
+    lens: LensOfFile = "up",
+    odometry: option(
+        Path, ".csv of time_s,distance_m,turn_rad or time_s,forward_m_s,yaw_rate_rad_s"
+    ),
     out: OutLog,
     truth: Truth = None,
     params: Motion = None,
@@ -162,36 +171,31 @@ def extract(
 ):
     """Make a log of images: vertical lines, matched and triangulated, with the odometry.
 
-    A folder says when its images were taken in frames.csv (image,time_s); otherwise
-    names that are seconds, a video's own times, or one image per command count.
-    What was interrupted goes on where it stopped.
+    When the images were taken is read from frames.csv (image,time_s), in their folder
+    or the one above. Without it: one image before the first command and one after
+    each, a video's own rate, or names that are seconds, whichever fits first.
+    The same command again goes on where an interrupted one stopped.
 
-    Example: jaxslam extract images/ --camera camera.toml --odometry odometry.csv --out OUT.npz
+    Example: jaxslam extract images/ --camera c.toml --odometry o.csv --out OUT.npz
     """
     from jaxslam.config import default_params
-    from jaxslam.log import NOT_USED
     from jaxslam.paramfile import load_params
     from jaxslam.vision.camera_files import load_camera
     from jaxslam.vision.extract import extract as run_extract
 
     check_new(out, overwrite)
-    with bar("extracting lines") as progress:
-        log = run_extract(
-            images,
-            load_camera(camera, mirror, lens),
-            odometry,
-            out,
-            truth=truth,
-            params=load_params(params, default_params("position")) if params else None,
-            overlay=overlay,
-            overwrite=overwrite,
-            progress=progress,
-        )
-    print(f"{out}: {log}; map it with: jaxslam run {out}")
-    lost = {why: n for why, n in log.skipped.items() if not why.startswith(NOT_USED)}
-    for why, count in lost.items():
-        warn(f"{count} skipped: {why}")
-    return int(bool(lost))
+    known = load_camera(camera, mirror, lens)
+    robot = load_params(params, default_params("position")) if params else None
+    try:
+        with bar("extracting lines") as progress:
+            log = run_extract(
+                images, known, odometry, out, truth=truth, params=robot, overlay=overlay,
+                overwrite=overwrite, progress=progress,
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        warn("stopped; the same command again goes on from here")
+        raise
+    return _account(log, out)
 
 
 def triangulate(
@@ -200,6 +204,7 @@ def triangulate(
     """Add points to a log of bearings: matched between frames, triangulated by odometry.
 
     The paper's way on any log; jaxslam run --sensor position then uses the points.
+    What extract wrote has points already.
 
     Example: jaxslam triangulate lost-in-the-woods OUT.npz
     """
@@ -214,7 +219,7 @@ def triangulate(
         robot = load_params(params, default_params("position", given)) if params else None
         found = triangulate_log(given, robot, progress=progress)
     save_log(out, found)
-    print(f"{out}: {found}; map it with: jaxslam run {out} --sensor position")
+    return _account(found, out, " --sensor position", given.skipped)
 
 
 def room(
@@ -223,16 +228,18 @@ def room(
     *,
     seed: Seed = 0,
     drive: option(
-        Drives, "round and round, straight along a wall, or turning on the spot"
+        Drives, "round and round the room, straight along a wall, or turning on the spot"
     ) = "loop",
     step: option(float, "between two images [m]") = 0.2,
-    length: option(float, "of the path [m]; of a turn [rad]") | None = None,
+    length: option(float, "of the path [m] (loop 60, straight 6); of a turn [rad] (a whole one)")
+    | None = None,
     preset: option(Presets, "light, blur and noise of the images") = "normal",
     overwrite: Overwrite = False,
 ):
     """Render the drive of a robot through a furnished room, seen by a mirror camera.
 
-    Writes images, commands (slip is in the truth only), cameras, and the truth.
+    Writes images, the commands (how wheels slipped is in the truth only), the camera,
+    and the truth: poses, landmarks, floor plan. A loop has some 300 images.
 
     Example: jaxslam simulate room rooms/1 --seed 1
     """
@@ -249,7 +256,8 @@ def room(
             overwrite=overwrite,
             progress=progress,
         )
-    print(f"{out}: {frames} images; next: jaxslam extract {out / 'images'} --help")
+    given = f"--camera {out / 'camera.toml'} --odometry {out / 'odometry.csv'} --truth {out}"
+    print(f"{out}: {frames} images; next: jaxslam extract {out / 'images'} {given} --out OUT.npz")
 
 
 def _board(text):
@@ -260,6 +268,26 @@ def _board(text):
     return tuple(sides)
 
 
-def _check_free(path, overwrite):
-    if path.exists() and not overwrite:
-        raise ValueError(f"{path}: exists; choose another name or add --overwrite")
+def _account(log, out, how="", told=()):
+    """Print what a log of lines holds and what was left out, but for what was `told` when the log
+    was made; the exit code."""
+    import numpy as np
+
+    from jaxslam.log import NOT_USED
+
+    points = int(np.isfinite(log.point[:, 0]).sum())
+    print(f"{out}: {log}, {points} points")
+    lost = False
+    for why, count in log.skipped.items():
+        if why.startswith(NOT_USED):
+            print(f"{count} {why}")
+        elif why not in told:
+            lost = True
+            warn(f"{why}: {count}")
+    if not len(log.frame):
+        warn("no line in any image: blurred, or is the camera's file another's?")
+    elif not points:
+        warn("no points: only jaxslam run --sensor bearing can map this")
+    else:
+        print(f"map it with: jaxslam run {out}{how}")
+    return int(lost or not points)

@@ -48,12 +48,14 @@ def bar(what, compiles=False):
         yield show
 
 
-def check_new(out, overwrite):
-    """Refuse a log's path that is no .npz file or is taken, before the work is done."""
-    if out.suffix != ".npz":
-        raise ValueError(f"{out}: a log is a .npz file; give its name last, as OUT.npz")
+def check_new(out, overwrite, what="a log", suffix=".npz"):
+    """Refuse a file's name that ends wrongly, is taken or in no folder, before the work is done."""
+    if out.suffix != suffix:
+        raise ValueError(f"{out}: {what} is a {suffix} file; name it like {out.stem}{suffix}")
     if out.exists() and not overwrite:
         raise ValueError(f"{out}: exists; choose another name or add --overwrite")
+    if not out.parent.is_dir():
+        raise ValueError(f"{out}: cannot write: there is no folder {out.parent}")
 
 
 def warn(text):

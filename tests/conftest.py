@@ -5,6 +5,8 @@ from pathlib import Path
 import jax
 import pytest
 
+from jaxslam import cli
+
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
@@ -22,3 +24,35 @@ def shared_data():
     if not folder.is_dir():
         pytest.skip("../shared/data is absent: recorded data that may not be redistributed")
     return folder
+
+
+@pytest.fixture
+def at(tmp_path, monkeypatch):
+    """An empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def call(capsys):
+    """Runs a command; gives exit code, stdout, stderr."""
+
+    def run(*argv):
+        code = cli.main([str(word) for word in argv])
+        return code, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def refuse(call):
+    """Runs a command that must be refused with 2 and one line; gives the line."""
+
+    def run(*argv):
+        code, out, err = call(*argv)
+        assert (code, out) == (2, "")
+        assert err.startswith("jaxslam: ")
+        assert err.count("\n") == 1
+        return err
+
+    return run

@@ -19,13 +19,6 @@ COMMANDS = ("demo", "run", "compare", "convert", "check", "evaluate", "plot")
 MANY = ("--particles", "50")
 
 
-@pytest.fixture
-def at(tmp_path, monkeypatch):
-    """An empty working directory."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 @pytest.fixture(scope="session")
 def short():
     """A log of 30 frames."""
@@ -42,31 +35,6 @@ def bearings_only(log):
     """What is left of a log whose sensor gave bearings and nothing else, and nobody the truth."""
     names = ("odometry_time", "odometry", "frame_time", "frame", "bearing", "view")
     return type(log)(name="plain", **{name: getattr(log, name) for name in names})
-
-
-@pytest.fixture
-def call(capsys):
-    """Runs a command; gives exit code, stdout, stderr."""
-
-    def run(*argv):
-        code = cli.main([str(word) for word in argv])
-        return code, *capsys.readouterr()
-
-    return run
-
-
-@pytest.fixture
-def refuse(call):
-    """Runs a command that must be refused with 2 and one line; gives the line."""
-
-    def run(*argv):
-        code, out, err = call(*argv)
-        assert (code, out) == (2, "")
-        assert err.startswith("jaxslam: ")
-        assert err.count("\n") == 1
-        return err
-
-    return run
 
 
 def write_csv(at):
