@@ -421,10 +421,6 @@ def test_degenerate_boards(corners, call, refuse):
     corners([p for p, taken in zip(many, right, strict=True) if taken])
     line = refuse(*CAMERA, "boards")
     assert "all corners lie within " in line and "move the board all round" in line
-    corners([many[0]] * 4)
-    line = refuse(*CAMERA, "boards")
-    assert "board0.png and board1.png are the same picture: one counts twice (2 more" in line
-    assert len(line) < 400
     # parallel to the image, all at one distance: it can't be told from the focal length
     flat = [board_points(BOARD, 20.0) + [100 + 30 * k, 40 + 25 * k] for k in range(4)]
     noise = np.random.default_rng(0).normal(0, 0.1, (4, 42, 2))
@@ -434,7 +430,7 @@ def test_degenerate_boards(corners, call, refuse):
     assert not os.listdir()
     corners(simulate_boards(FISHEYE, 5, 0.1, distance=(0.2, 0.2), **given)[0])
     code, out, _ = call(*CAMERA, "boards")
-    assert code == 1
+    assert code == 0
     assert "warning: all boards are at one distance: bring some nearer and some farther" in out
 
 
