@@ -102,6 +102,11 @@ def identified(log):
     return replace(log, truth=replace(truth, landmark_id=ids, identity=found))
 
 
+def coverage(errors):
+    """Share of the points within their own 95 % ellipse, as propagated."""
+    return float((_square("propagated normal", (1.0,), errors) < _bound95(np.inf)).mean())
+
+
 def compare(errors):
     """`Model`s of all candidates, the preferred one first; fitted on all points, scored two-fold.
 

@@ -7,7 +7,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.odometry import ODOMETRY
-from calibration.points import Model, PointErrors, compare, identified, point_errors
+from calibration.points import (
+    Model,
+    PointErrors,
+    compare,
+    coverage,
+    identified,
+    point_errors,
+)
 from calibration.sensor import ErrorModel, fit
 from jaxslam.config import UNITS, Params
 from jaxslam.evaluate import truth_at
@@ -89,7 +96,8 @@ def _counted(errors):
     off = np.linalg.norm(errors.point - errors.true, axis=1)
     counts = ", ".join(f"{count} {what}" for what, count in errors.counts.items())
     median, most = np.median(off), np.quantile(off, 0.95)
-    return f"{counts}; error {100 * median:.1f} cm in the median, {100 * most:.1f} cm at 95 %"
+    told = f"error {100 * median:.1f} cm in the median, {100 * most:.1f} cm at 95 %"
+    return f"{counts}; {told}; {100 * coverage(errors):.1f} % within their own 95 % ellipse"
 
 
 def draw(report, log, path):

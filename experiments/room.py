@@ -21,7 +21,7 @@ import numpy as np
 from line_truth import CONTRAST, TALL, named
 
 from calibration import sensor_report
-from calibration.points import with_model
+from calibration.points import coverage, point_errors, with_model
 from jaxslam import config_for, default_params, run
 from jaxslam.evaluate import pair_by_distance, truth_at
 from jaxslam.furnish import furnish
@@ -119,9 +119,16 @@ def score(result, seed, log):
         "mapped": len(mapped),
         "landmarks": len(mean),
         "spurious": len(mean) - len(pairs),
+        "in_95": points_covered(log, seed),
         "frames": len(log.frame_time),
         "measurements": len(log.frame),
     }
+
+
+def points_covered(log, seed):
+    """Share of the triangulated points within their own 95 % ellipse about the true edge."""
+    truth = replace(log.truth, landmarks=furnish(seed).edges.point, landmark_id=None)
+    return coverage(point_errors(replace(log, truth=truth), log.noise["gain_tran"]))
 
 
 COLUMNS = (
@@ -132,6 +139,7 @@ COLUMNS = (
     ("edges", "edges in view", "{}"),
     ("mapped", "mapped", "{}"),
     ("spurious", "spurious", "{}"),
+    ("in_95", "points in 95 %", "{:.3f}"),
     ("reckoning_m", "dead reckoning [m]", "{:.2f}"),
 )
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibration import sensor, sensor_report
-from calibration.points import compare, identified, point_errors, with_model
+from calibration.points import compare, coverage, identified, point_errors, with_model
 from jaxslam.log import Log, Truth
 
 STEP, SIGMA = 0.3, math.radians(0.2)
@@ -185,3 +185,11 @@ def test_a_log_without_points_tells_of_bearings_only(tmp_path):
     assert "position_scale" not in sensor_report.values(report)[0]
     with pytest.raises(ValueError, match="no triangulated points"):
         sensor_report.draw(report, log, tmp_path / "points.png")
+
+
+def test_coverage_is_the_share_within_the_ellipses():
+    true_to_size = point_errors(
+        straight(13, lambda rng, cov, t: rng.multivariate_normal((0, 0), cov))
+    )
+    assert 0.93 < coverage(true_to_size) < 0.97
+    assert coverage(point_errors(straight(13, normal))) < 0.80  # errors half as large again
