@@ -7,7 +7,6 @@ the plan under `truth/` and `plan/`, and numbers under `noise/` and `skipped/`. 
 """
 
 import math
-import os
 import zipfile
 from dataclasses import dataclass, field, fields
 from importlib import resources
@@ -16,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.arrays import assign, check_rows, check_stamps, checked, checked_number
+from jaxslam.atomic import replacing
 from jaxslam.config import Params
 
 SCHEMA = 1
@@ -276,23 +276,13 @@ def save_log(path, log):
     path = Path(path)
     if path.suffix != ".npz":
         raise ValueError(f"{path}: a log is a .npz file; name it {path.name}.npz")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            with zipfile.ZipFile(file, "w") as archive:
-                for name, array in _entries(log).items():
-                    # A fixed date: the same log makes the same bytes.
-                    entry = zipfile.ZipInfo(name + ".npy", (1980, 1, 1, 0, 0, 0))
-                    entry.compress_type = zipfile.ZIP_DEFLATED
-                    with archive.open(entry, "w", force_zip64=True) as member:
-                        np.lib.format.write_array(member, array, allow_pickle=False)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as err:
-        raise ValueError(f"{path}: cannot write ({err.strerror}); choose another place") from err
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
+        for name, array in _entries(log).items():
+            # A fixed date: the same log makes the same bytes.
+            entry = zipfile.ZipInfo(name + ".npy", (1980, 1, 1, 0, 0, 0))
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            with archive.open(entry, "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
 
 
 def _entries(log):

@@ -5,11 +5,11 @@ file may hold only some of the names.
 """
 
 import math
-import os
 import tomllib
 from difflib import get_close_matches
 from pathlib import Path
 
+from jaxslam.atomic import replacing
 from jaxslam.config import UNITS, Params
 
 MEANING = {
@@ -110,17 +110,8 @@ def save_params(path, params, standard_errors=None):
         for name, value in standard_errors.items():
             _check_name(path, f"{ERRORS}.", name)
             lines.append(f"{name} = {_number(path, f'{ERRORS}.{name}', value)!r}\n")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "w", encoding="utf-8", newline="\n") as file:
-            file.writelines(lines)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as err:
-        raise ValueError(f"{path}: cannot write ({err.strerror}); choose another place") from err
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as file:
+        file.write("".join(lines).encode())
 
 
 def _read(path):

@@ -3,9 +3,7 @@
 What is estimated is drawn as it is, not aligned to the truth, since the start pose is given.
 """
 
-import os
 from pathlib import Path
-from secrets import token_hex
 
 import matplotlib
 import numpy as np
@@ -15,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullFormatter
 
+from jaxslam.atomic import replacing
 from jaxslam.evaluate import truth_at, with_truth, wrap
 
 FIGURES = ("map.png", "error.png", "particles.png")
@@ -291,13 +290,7 @@ def _time_axis(axes, seconds):
 
 def write_figure(figure, path):
     """Save a figure as PNG, whole or not at all."""
-    partial = path.with_name(f".{path.name}.{token_hex(4)}")
-    try:
-        FigureCanvasAgg(figure)
-        figure.savefig(partial, format="png", dpi=DPI, bbox_inches="tight", pad_inches=0.12)
-        os.replace(partial, path)
-    except OSError as error:
-        raise ValueError(f"{path}: can't be written ({error.strerror})") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    FigureCanvasAgg(figure)
+    with replacing(path) as file:
+        figure.savefig(file, format="png", dpi=DPI, bbox_inches="tight", pad_inches=0.12)
     return path

@@ -11,12 +11,12 @@ import math
 import os
 import shutil
 from pathlib import Path
-from secrets import token_hex
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from jaxslam.atomic import beside, move_folder
 from jaxslam.drive import stop_and_go
 from jaxslam.furnish import furnish
 from jaxslam.raycast import camera_rays, expose, scene
@@ -171,14 +171,14 @@ def render_room(
     )
     world = furnish(seed, shadows=shadows, plain=plain)
     target = _target(out, overwrite)
-    partial = target.with_name(f".{target.name}.{token_hex(4)}")
+    partial = beside(target)
     try:
         (partial / "images").mkdir(parents=True)
         _write(partial, world, driven, camera, effects, seed, progress)
         lines = [f"{name} = {json.dumps(v)}" for name, v in settings.items() if v is not None]
         lines += ["", "[effects]", *(f"{k} = {v!r}" for k, v in effects._asdict().items())]
         _text(partial / "room.toml", lines)
-        _move(partial, target)
+        move_folder(partial, target, overwrite)
     except OSError as error:
         if error.errno == errno.ENOSPC:
             raise
@@ -247,21 +247,6 @@ def _target(out, overwrite):
         if not (target / "room.toml").is_file():
             raise ValueError(f"{out}: is not a rendered room, so it is not overwritten")
     return target
-
-
-def _move(partial, target):
-    old = None
-    if target.exists():
-        old = target.with_name(f".{target.name}.{token_hex(4)}")
-        os.rename(target, old)
-    try:
-        os.rename(partial, target)
-    except BaseException:
-        if old:
-            os.rename(old, target)
-        raise
-    if old:
-        shutil.rmtree(old, ignore_errors=True)
 
 
 def _effects(preset):

@@ -15,12 +15,12 @@ from math import cos, isfinite, sin
 from numbers import Integral
 from pathlib import Path
 from platform import python_version
-from secrets import token_hex
 from zipfile import BadZipFile
 
 import numpy as np
 
 from jaxslam import plot
+from jaxslam.atomic import beside, move_folder, sync
 from jaxslam.config import Config, Params
 from jaxslam.evaluate import errors
 from jaxslam.log import BUNDLED, load_log, save_log
@@ -45,14 +45,14 @@ def save(result, directory, overwrite=False, log_source=None, figures=True):
     target = directory.resolve()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        partial = _beside(target)
+        partial = beside(target)
         partial.mkdir()
     except OSError as error:
         raise _unwritable(directory, error) from error
     try:
         _write_files(result, partial, _source(log_source, target))
-        _sync(*partial.iterdir(), partial)
-        _move_into_place(partial, target, overwrite)
+        sync(*partial.iterdir(), partial)
+        move_folder(partial, target, overwrite)
     except OSError as error:
         if error.errno == errno.ENOSPC:
             raise
@@ -287,35 +287,6 @@ def _write_files(result, folder, source):
     }.items():
         with open(folder / name, "w", encoding="utf-8", newline="\n") as file:
             file.writelines(lines)
-
-
-def _beside(target):
-    """A name nobody uses, in the same folder, so that renaming it to `target` is one step."""
-    return target.with_name(f".{target.name}.{token_hex(4)}")
-
-
-def _sync(*paths):
-    for path in paths:
-        handle = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
-
-
-def _move_into_place(partial, target, overwrite):
-    old = _beside(target) if overwrite and target.exists() else None
-    if old:
-        os.rename(target, old)
-    try:
-        os.rename(partial, target)
-    except BaseException:
-        if old:
-            os.rename(old, target)
-        raise
-    _sync(target.parent)
-    if old:
-        shutil.rmtree(old, ignore_errors=True)
 
 
 def _source(log_source, target):

@@ -165,7 +165,7 @@ def test_saved_runs_are_drawn_anew(tmp_path):
 
 
 def test_an_unwritable_place_is_a_one_line_error(tmp_path):
-    with pytest.raises(ValueError, match=r"map\.png: can't be written"):
+    with pytest.raises(ValueError, match=r"map\.png: cannot write"):
         plot.plot(make_result(), tmp_path / "missing")
 
 

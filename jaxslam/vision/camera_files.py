@@ -5,11 +5,11 @@
 sits on the robot. Errors are `ValueError` naming file, field and what was found.
 """
 
-import os
 import tomllib
 from dataclasses import fields
 from pathlib import Path
 
+from jaxslam.atomic import replacing
 from jaxslam.vision.camera import MODELS, Camera, parameter_names
 from jaxslam.vision.camera_formats import (
     from_kalibr,
@@ -40,17 +40,8 @@ def save_camera(path, camera, kind=None):
         text = writers[kind](camera)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise ValueError(f"{path}: can't be written ({error.strerror})") from error
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as file:
+        file.write(text.encode())
 
 
 def load_camera(path, mirror=False, lens="up"):

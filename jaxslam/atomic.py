@@ -1,0 +1,59 @@
+"""Files and folders that appear whole or not at all."""
+
+import os
+import shutil
+from contextlib import contextmanager
+from pathlib import Path
+from secrets import token_hex
+
+
+@contextmanager
+def replacing(path):
+    """A binary file that becomes `path` once it is written and on the disk.
+
+    Whatever goes wrong, the old file stays and nothing is left beside it. Raises `ValueError` where
+    the place can't be written.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as err:
+        raise ValueError(f"{path}: cannot write ({err.strerror}); choose another place") from err
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def move_folder(partial, target, overwrite):
+    """Rename the folder `partial` to `target`, with `overwrite` in place of one that is there."""
+    old = beside(target) if overwrite and target.exists() else None
+    if old:
+        os.rename(target, old)
+    try:
+        os.rename(partial, target)
+    except BaseException:
+        if old:
+            os.rename(old, target)
+        raise
+    sync(target.parent)
+    if old:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def beside(target):
+    """A name nobody uses, in the same folder, so that renaming it to `target` is one step."""
+    return target.with_name(f".{target.name}.{token_hex(4)}")
+
+
+def sync(*paths):
+    """See files or folders onto the disk."""
+    for path in paths:
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
