@@ -30,6 +30,13 @@ _WHERE = {
     "Info": "filter",
     "errors": "evaluate",
     "planar": "simulate",
+    "Camera": "vision.camera",
+    "load_camera": "vision.camera_files",
+    "save_camera": "vision.camera_files",
+    "extract_lines": "vision.lines",
+    "extract": "vision.extract",
+    "triangulate_log": "vision.points",
+    "render_room": "render",
 }
 __version__ = "0.1.0"
 __all__ = sorted(_WHERE)
