@@ -1,9 +1,5 @@
 """Camera calibration: simulated boards against the true camera, bad sets, real images."""
 
-import subprocess
-import sys
-import time
-
 import jax
 import numpy as np
 import pytest
@@ -262,21 +258,3 @@ def test_real_sets(shared_data, folder, board, mirror, images, fit, left_out):
     assert len(found.names) == images and not found.rejected and not found.outliers
     assert (np.round([found.mean, found.rms], 3) <= fit).all()
     assert (np.round(held_out_px(found), 3) <= left_out).all()
-
-
-COLD = """
-import pickle, sys
-from calibration.camera import calibrate_corners
-given = pickle.load(open(sys.argv[1], "rb"))
-print(calibrate_corners(**given).rms)
-"""
-
-
-@pytest.mark.slow
-def test_a_cold_calibration_takes_seconds(tmp_path):
-    import pickle
-
-    (tmp_path / "given").write_bytes(pickle.dumps(boards(MIRROR, 10, 0.2)))
-    begin = time.perf_counter()
-    subprocess.run([sys.executable, "-c", COLD, tmp_path / "given"], check=True)
-    assert time.perf_counter() - begin < 10  # 3 s on an idle core

@@ -341,11 +341,11 @@ def outside(command):
     return found.returncode, found.stdout, found.stderr
 
 
-def test_help_comes_within_a_second():
+def test_help_imports_nothing_heavy():
     program = (
-        "import sys, time; from jaxslam.cli import main; main(['--help']); "
+        "import sys; from jaxslam.cli import main; main(['--help']); "
         "heavy = {'jax', 'matplotlib', 'scipy'} & set(sys.modules); "
-        "sys.exit(bool(heavy) or time.process_time() > 1)"
+        "sys.exit(bool(heavy))"
     )
     assert outside(f'{sys.executable} -c "{program}"')[0] == 0
 

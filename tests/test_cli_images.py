@@ -374,10 +374,10 @@ def test_help_has_an_example(call, command):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_comes_within_a_second_and_needs_neither_jax_nor_opencv(command):
+def test_help_needs_neither_jax_nor_opencv(command):
     program = (
-        f"import sys, time; from jaxslam.cli import main; main([*{command.split()}, '--help']); "
+        f"import sys; from jaxslam.cli import main; main([*{command.split()}, '--help']); "
         "heavy = {'jax', 'cv2', 'matplotlib', 'scipy'} & set(sys.modules); "
-        "sys.exit(bool(heavy) or time.process_time() > 1)"
+        "sys.exit(bool(heavy))"
     )
     assert outside(f'{sys.executable} -c "{program}"')[0] == 0

@@ -1,7 +1,6 @@
 """Frames: odometry integrated exactly between them, measurements in slots."""
 
 import itertools
-import time
 
 import numpy as np
 import pytest
@@ -189,7 +188,7 @@ def test_dead_reckoning_of_the_bundled_log():
     assert np.abs(poses[:, 2]).max() <= np.pi
 
 
-def test_an_hour_at_full_rate_takes_a_moment():
+def test_an_hour_at_full_rate_keeps_every_row():
     rng = np.random.default_rng(0)
     log = make(
         np.arange(60_000) * 0.015,
@@ -198,9 +197,9 @@ def test_an_hour_at_full_rate_takes_a_moment():
         np.repeat(np.arange(13_000), 5),
         identity=np.tile(np.arange(5), 13_000),
     )
-    began = time.perf_counter()
-    frames(log, "bearing", known=True)
-    assert time.perf_counter() - began < 2
+    found = frames(log, "bearing", known=True)
+    assert np.array_equal(found.row.ravel(), np.arange(65_000))
+    assert found.dropped == {}
 
 
 def five(**changes):
