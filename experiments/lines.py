@@ -11,7 +11,6 @@ of their matches that are again so near to the same edge, recall that of those w
 line in both frames.
 """
 
-import sys
 import time
 from pathlib import Path
 
@@ -87,7 +86,7 @@ def main():
     cv2.setNumThreads(1)
     text = ["| images | bearing, RMS | robust SD | false lines a frame | recall | RMS of error / σ "
             "| time | frames |", "|---" * 8 + "|"]  # fmt: skip
-    for preset in PRESETS if "--matches" not in sys.argv else ():
+    for preset in PRESETS:
         text.append(lines_row(preset))
         print(text[-1], flush=True)
     text += ["", "| step | colour | precision | recall | matches |", "|---" * 5 + "|"]
