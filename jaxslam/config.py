@@ -90,7 +90,8 @@ class Params(NamedTuple):
     Motion noise grows with what was driven: variance `err_tran**2` per metre, `err_rot**2` per
     radian turned, `err_drift**2` rad^2 per metre, and the floors per second. Gains are true over
     measured odometry. The bearing's variance is `sigma_bearing**2 + (growth / range)**2`: a tube or
-    a door edge has a size. `view_*` is what the sensor can see and is declared by the log.
+    a door edge has a size. Errors of one landmark's measurements stay alike over a path of
+    `correlation`: standing still tells nothing new (0: always independent). `view_*` is what the sensor can see and is declared by the log.
     """
 
     err_tran: float
@@ -105,6 +106,7 @@ class Params(NamedTuple):
     sigma_bearing: float
     growth: float
     position_scale: float
+    correlation: float
     mount_x: float
     mount_y: float
     mount_yaw: float
@@ -136,6 +138,7 @@ UNITS = {
     "sigma_bearing": "rad",
     "growth": "m",
     "position_scale": "factor",
+    "correlation": "m",
     "mount_x": "m",
     "mount_y": "m",
     "mount_yaw": "rad",
@@ -169,6 +172,7 @@ _DEFAULTS = Params(
     sigma_bearing=0.05,
     growth=0.12,
     position_scale=1.0,
+    correlation=0.0,
     mount_x=0.0,
     mount_y=0.0,
     mount_yaw=0.0,

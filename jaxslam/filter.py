@@ -37,19 +37,23 @@ class Estimate(NamedTuple):
 class Info(NamedTuple):
     """What is known about one step; counts are over all particles.
 
-    `match` [K, N]: slot matched, or -1 new, -2 clutter, -3 padding. `label` [K]: the best
-    particle's matches as births (`Landmarks.birth`). `ancestors` [N]. `new`: landmarks that the
+    `pose` [3, N] and `log_weight` [N] of all particles, before resampling. `match` [K, N]: slot
+    matched, or -1 new, -2 clutter, -3 padding. `birth`
+    [K, N]: the same as births (`Landmarks.birth`) of the landmarks matched. `ancestors` [N]: which
+    of these particles each particle after resampling continues. `new`: landmarks that the
     best particle began. `overflow`: landmarks lost for want of a slot. `nonfinite`: particles whose
     weight became NaN or infinite. `degenerate`: no weight was left, all were made equal.
     """
 
+    pose: jax.Array
+    log_weight: jax.Array
     estimate: Estimate
     ess: jax.Array
     log_evidence: jax.Array
     resampled: jax.Array
     ancestors: jax.Array
     match: jax.Array
-    label: jax.Array
+    birth: jax.Array
     new: jax.Array
     outliers: jax.Array
     overflow: jax.Array
@@ -110,8 +114,9 @@ def advance(chance, state, odometry, measurements, params, config):
     normals, uniform = chance
     pose = jnp.stack(motion.sample(state.pose, odometry, params, normals))
     measurements = sensors.rescaled(measurements, params)
+    noise = sensors.correlated(params, odometry)
     world, density, match, counts = _observe(
-        pose, state.landmarks, measurements, params, config, state.step
+        pose, state.landmarks, measurements, params, noise, config, state.step
     )
     # A pose that is not a number fits nothing, which would count as new landmarks: no weight.
     sound = jnp.isfinite(pose).all(0)
@@ -124,17 +129,18 @@ def advance(chance, state, odometry, measurements, params, config):
     wanted = measurements.active & ((ess < threshold * config.particles) | (threshold >= 1))
     moved = State(pose, world, log_weight, state.step + 1)
     resampled, ancestors = _resample(moved, wanted, uniform, config)
-    best_match, best_birth = match[:, estimate.best], world.birth[:, estimate.best]
-    label = jnp.where(best_match >= 0, best_birth[jnp.maximum(best_match, 0)], best_match)
+    birth = jnp.take_along_axis(world.birth, jnp.maximum(match, 0), 0)
     info = Info(
+        pose=pose,
+        log_weight=log_weight,
         estimate=estimate,
         ess=ess,
         log_evidence=log_evidence,
         resampled=wanted,
         ancestors=ancestors,
         match=match,
-        label=label,
-        new=jnp.sum(best_match == NEW),
+        birth=jnp.where(match >= 0, birth, match),
+        new=jnp.sum(match[:, estimate.best] == NEW),
         outliers=jnp.sum(match == CLUTTER),
         overflow=counts[0].sum(),
         forgotten=counts[1].sum(),
@@ -155,9 +161,10 @@ def run(key, state, odometry, measurements, params, config, summarise=lambda inf
     return jax.lax.scan(body, state, (odometry, measurements))
 
 
-def _observe(pose, world, measurements, params, config, number):
+def _observe(pose, world, measurements, params, noise, config, number):
     """Associate, weigh and update, block by block so that a block's temporaries stay in cache.
 
+    `noise`: `params` whose measurement noise allows for what the last frame told already.
     Returns the map, log densities [N], matches [K, N], and counts [2, N]: overflow, forgotten.
     """
     n = config.particles
@@ -176,7 +183,9 @@ def _observe(pose, world, measurements, params, config, number):
         # reading and writing of the large arrays stops its vectorisation: ten times slower.
         done = jax.lax.cond(
             measurements.active,
-            lambda poses, mine: _observe_block(poses, mine, measurements, params, config, number),
+            lambda poses, mine: _observe_block(
+                poses, mine, measurements, params, noise, config, number
+            ),
             lambda poses, mine: (mine, *_nothing(config, size, pose.dtype)),
             poses,
             mine,
@@ -200,18 +209,18 @@ def _block_size(config):
     return next(size for size in range(min(config.block, n), 0, -1) if n % size == 0)
 
 
-def _observe_block(sensor_pose, before, measurements, params, config, step_number):
+def _observe_block(sensor_pose, before, measurements, params, noise, config, step_number):
     """The frame's measurements on one block of particles, as `_observe`."""
     parts = tuple(before.anchor) if before.anchor is not None else None
     seen = sensors.observe(config.sensor, sensor_pose, tuple(before.mean), parts, params)
     if not config.clutter:
-        params = params._replace(outlier=jnp.zeros(()))
+        params, noise = (p._replace(outlier=jnp.zeros(())) for p in (params, noise))
     scorer = landmarks.scorer(config.sensor, seen, before, jnp.log1p(-params.outlier))
     new = sensors.log_new_density(config.sensor, tuple(measurements.value.T), params)
     clutter = sensors.log_clutter_density(config.sensor, params)
     match = association.associate(config, scorer, measurements, new, clutter, params)
     world, density = landmarks.update_matched(
-        config.sensor, sensor_pose, before, match, measurements, params
+        config.sensor, sensor_pose, before, match, measurements, noise
     )
     density = density + jnp.where(match == NEW, new[:, None], 0).sum(0)
     if config.clutter:

@@ -25,6 +25,7 @@ MEANING = {
     "sigma_bearing": "noise of a bearing, far away",
     "growth": "sideways noise of what is seen: it has a size",
     "position_scale": "multiplies the standard deviations of positions",
+    "correlation": "path over which errors stay alike",
     "mount_x": "sensor on the robot, forward",
     "mount_y": "sensor on the robot, left",
     "mount_yaw": "sensor on the robot, counter-clockwise",
@@ -45,7 +46,7 @@ MEANING = {
 ABOVE_ZERO = ("gain_tran", "gain_rot", "sigma_range", "sigma_bearing", "position_scale")
 ABOVE_ZERO += ("density_new", "view_range", "inv_depth_mean", "inv_depth_sd", "existence_max")
 AT_LEAST_ZERO = ("err_tran", "err_rot", "err_drift", "floor_tran", "floor_rot", "growth")
-AT_LEAST_ZERO += ("existence_seen", "existence_miss")
+AT_LEAST_ZERO += ("correlation", "existence_seen", "existence_miss")
 ERRORS = "standard_error"
 MAX_BYTES = 1 << 20
 

@@ -195,10 +195,10 @@ def _summarise(info):
     return Summary(
         pose=info.estimate.mean,
         cov=info.estimate.cov,
-        match=info.label,
+        match=info.birth[:, info.estimate.best],
         survivor=survivor,
         **{name: getattr(info, name) for name in Summary._fields if hasattr(info, name)
-           and name != "match"},
+           and name not in ("pose", "match")},
     )  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from jaxslam import geometry
 from jaxslam.geometry import direction, norm, wrap
 
 LEAST_INVERSE_DEPTH = 1e-3
+MOST_INFLATION = 1e4  # of a variance, when the robot stands
 LOG_2PI = math.log(2 * math.pi)
 
 
@@ -59,6 +60,21 @@ def rescaled(measurements, params):
         return measurements
     gain = 1 + measurements.scale * (params.gain_tran - 1)
     return measurements._replace(value=measurements.value * gain[:, None])
+
+
+def correlated(params, odometry):
+    """`Params` whose measurement noise is that of one independent measurement per correlation.
+
+    Errors that follow a first-order autoregression in the travelled path d have correlation
+    exp(-d / correlation) from frame to frame; many such frames tell as much as independent ones
+    with coth(d / (2 correlation)) times the variance.
+    """
+    on = params.correlation > 0
+    half = odometry.distance / (2 * jnp.where(on, params.correlation, 1.0))
+    inflation = 1 / jnp.tanh(jnp.clip(half, 1 / MOST_INFLATION, 10.0))
+    root = jnp.where(on, jnp.sqrt(inflation), 1.0)
+    names = ("sigma_bearing", "growth", "sigma_range", "position_scale")
+    return params._replace(**{name: getattr(params, name) * root for name in names})
 
 
 def pose_of(pose, params):
