@@ -1,0 +1,117 @@
+"""The posterior over the whole path, from the particles' genealogy.
+
+Particles that are resampled away take their past with them: what is left is a tree, whose old
+levels shrink to one node. It is kept on the host and cut back as it grows (Jacob, Murray and
+Rubenthaler, "Path storage in the particle filter", Statistics and Computing 2015).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Ancestral(NamedTuple):
+    """The smoothed path, T frames: mean `pose` [T, 3] (m, rad), `cov` [T, 3, 3], and how many
+    `distinct` [T] ancestors the particles of the end have there. One ancestor has no spread, which
+    does not mean that it is right."""
+
+    pose: np.ndarray
+    cov: np.ndarray
+    distinct: np.ndarray
+
+
+class Lineage(NamedTuple):
+    """One particle's whole past: `pose` [T, 3] and `birth` [T, K], as `filter.Info.birth`."""
+
+    pose: np.ndarray
+    birth: np.ndarray
+
+
+class Tree:
+    """Every pose that still has a living descendant, frame by frame.
+
+    Level t has n_t nodes: `pose[t]` [n_t, 3] and `birth[t]` [n_t, K]. `origin[t]` [n_(t+1)] are the
+    rows of level t that the nodes of the next descend from; the last one's, [N], are the particles.
+    """
+
+    def __init__(self):
+        self.pose, self.birth, self.origin = [], [], []
+
+    @property
+    def nodes(self):
+        return sum(map(len, self.pose))
+
+    def extend(self, pose, birth, ancestors):
+        """Add C frames: `pose` [C, 3, N] and `birth` [C, K, N] of all particles before resampling,
+        and `ancestors` [C, N]: which of them each particle after it continues."""
+        first, levels = len(self.pose), []
+        follow = ancestors[-1]
+        for t in reversed(range(len(ancestors))):
+            alive, rows = _used(follow, ancestors.shape[1])
+            levels.append((pose[t].T[alive], birth[t].T[alive], rows))
+            follow = ancestors[t - 1][alive]
+        if first:
+            self.origin[-1] = self.origin[-1][alive]
+        for level in reversed(levels):
+            for column, part in zip((self.pose, self.birth, self.origin), level, strict=True):
+                column.append(part)
+        self._prune(first)
+
+    def _prune(self, end):
+        """Forget the nodes before level `end` whose last descendant has died."""
+        for t in reversed(range(end)):
+            alive, self.origin[t] = _used(self.origin[t], len(self.pose[t]))
+            if len(alive) == len(self.pose[t]):  # then nothing older has lost a child either
+                break
+            self.pose[t], self.birth[t] = self.pose[t][alive], self.birth[t][alive]
+            if t:
+                self.origin[t - 1] = self.origin[t - 1][alive]
+
+
+def _used(rows, n):
+    """The rows of n that occur in `rows`, in order, and where each of `rows` is among them."""
+    used = np.zeros(n, bool)
+    used[rows] = True
+    place = np.cumsum(used, dtype=np.int32) - 1
+    return np.flatnonzero(used), place[rows]
+
+
+def ancestral(tree, log_weight):
+    """`Ancestral`: the weighted mean and covariance of whole paths, by the final `log_weight` [N].
+
+    The heading's mean is circular. Particles without weight do not count as descendants.
+    """
+    log_weight = np.asarray(log_weight, float)
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    total = len(tree.pose)
+    mean, cov, distinct = np.empty((total, 3)), np.empty((total, 3, 3)), np.empty(total, np.int64)
+    for t in reversed(range(total)):
+        weight = np.bincount(tree.origin[t], weight, len(tree.pose[t]))
+        have = weight > 0
+        mean[t], cov[t] = _moments(tree.pose[t][have].astype(float), weight[have])
+        distinct[t] = have.sum()
+    return Ancestral(mean, cov, distinct)
+
+
+def _moments(pose, weight):
+    """Mean [3] and covariance [3, 3] of weighted poses [n, 3]."""
+    heading = pose[:, 2]
+    turn = np.arctan2(weight @ np.sin(heading), weight @ np.cos(heading))
+    mean = np.array([weight @ pose[:, 0], weight @ pose[:, 1], turn])
+    off = pose - mean
+    off[:, 2] = np.arctan2(np.sin(off[:, 2]), np.cos(off[:, 2]))
+    return mean, (off * weight[:, None]).T @ off
+
+
+def lineage(tree, particle):
+    """`Lineage` of one of the living particles."""
+    row, rows = particle, []
+    for origin in reversed(tree.origin):
+        row = int(origin[row])
+        rows.append(row)
+    pose, birth = (
+        np.stack([level[row] for level, row in zip(column, reversed(rows), strict=True)])
+        for column in (tree.pose, tree.birth)
+    )
+    return Lineage(pose.astype(float), birth.astype(np.int64))
