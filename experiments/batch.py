@@ -1,0 +1,244 @@
+"""The batch bearing-only solution with known identities by GTSAM: what a smoother could reach.
+
+    python experiments/batch.py                    the table of all logs, and the noise's part in it
+    python experiments/batch.py --gains            writes experiments/params/mrclam_d6_r*.toml
+
+All measurements at once, started at the true path; same model as the filter's: `motion.model` with
+its gains and the full covariance of every interval, `sensors`' bearing noise (range dependent, at
+the current estimate; inflated by `sensors.correlated`), mounting, exact start. The robust kernel is
+the filter's too: Gaussian plus uniform clutter with probability `outlier`, by expectation
+maximisation: each measurement weighs its posterior probability of not being clutter. Needs GTSAM
+(`pip install gtsam`). MRCLAM may not be redistributed: ../shared/data/mrclam, or left out.
+"""
+
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxslam import sensors
+from jaxslam.evaluate import align_se2, ate, map_error, truth_at, with_truth, wrap
+from jaxslam.frames import frames
+from jaxslam.motion import model
+
+HERE = Path(__file__).parent
+RESULTS, PARAMS = HERE / "results", HERE / "params"
+MRCLAM = HERE.parents[1] / "shared" / "data" / "mrclam" / "MRCLAM_Dataset6"
+MISSING = "GTSAM is not installed (pip install gtsam): no batch solution"
+SETTLED = 1e-4  # m: rounds end when no pose moves farther
+TINY = 1e-6  # m, rad: noise of what the model takes for exact; GTSAM needs some
+
+
+class Batch(NamedTuple):
+    """Path `pose` [T, 3] of the robot and `landmarks` [L, 2] in the world, their `identity` [L],
+    `weight` [n]: that a measurement is no clutter; `residual` [n] of the bearings, rad."""
+
+    pose: np.ndarray
+    landmarks: np.ndarray
+    identity: np.ndarray
+    weight: np.ndarray
+    residual: np.ndarray
+    rounds: int
+    settled: bool
+    seconds: float
+
+
+def installed():
+    """Whether GTSAM can be imported."""
+    try:
+        import gtsam  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def solve(log, params, start=None, rounds=30):
+    """`Batch` of a log with bearings and identities; `start` [T, 3]: None for the true path.
+
+    Where truth is missing, odometry carries the start on. Landmarks start where the bearings seen
+    from the starting path meet.
+    """
+    begin = time.perf_counter()
+    data = frames(log, "bearing", None, params, True)
+    frame, slot = np.nonzero(data.measurements.valid)
+    who, bearing = data.measurements.identity[frame, slot], data.measurements.value[frame, slot, 0]
+    pose = true_start(log, data) if start is None else np.array(start, float)
+    sensor = compose(pose, mounting(params))
+    points = triangulate(sensor[frame], bearing, who, len(data.identities))
+    move, cov = motion(data.odometry, params)
+    first = compose(np.array(log.start_pose)[None], mounting(params))[0]
+    fixed = prior(log, params), first
+    noise = bearing_noise(data.odometry, params)
+    for done in range(rounds):
+        offset = points[who] - sensor[frame, :2]
+        residual = wrap(np.arctan2(offset[:, 1], offset[:, 0]) - sensor[frame, 2] - bearing)
+        variance = noise[0][frame] + noise[1][frame] / (offset**2).sum(1)
+        weight = inlier(residual, variance, noise, frame, params)
+        before = sensor
+        sensor, points = optimise(
+            fixed, (move, cov), (frame, who, bearing, variance / weight), (sensor, points)
+        )
+        settled = np.abs((sensor - before)[:, :2]).max() < SETTLED
+        if settled:
+            break
+    inverse = compose_inverse(mounting(params))
+    seconds = time.perf_counter() - begin
+    return Batch(compose(sensor, inverse), points, data.identities, weight, residual, done + 1,
+                 bool(settled), seconds)  # fmt: skip
+
+
+def optimise(fixed, chain, bearings, values):
+    """One Gaussian least-squares problem by GTSAM: sensor poses [T, 3] and landmarks [L, 2].
+
+    `fixed`: covariance and pose before the first interval; `chain`: motion [T, 3] and covariance
+    [T, 3, 3]; `bearings`: frame, landmark, value and variance, each [n].
+    """
+    import gtsam
+    from gtsam.noiseModel import Gaussian, Isotropic
+
+    graph, initial = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    (cov, first), (poses, points) = fixed, values
+    lift = len(poses) + 1
+    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*first), Gaussian.Covariance(cov)))
+    initial.insert(0, gtsam.Pose2(*first))
+    for i, (move, noise, pose) in enumerate(zip(*chain, poses, strict=True)):
+        initial.insert(i + 1, gtsam.Pose2(*pose))
+        noise = Gaussian.Covariance(noise)
+        graph.add(gtsam.BetweenFactorPose2(i, i + 1, gtsam.Pose2(*move), noise))
+    for i, point in enumerate(points):
+        initial.insert(lift + i, gtsam.Point2(*point))
+    for t, who, value, variance in zip(*(part.tolist() for part in bearings), strict=True):
+        noise = Isotropic.Sigma(1, variance**0.5)
+        graph.add(gtsam.BearingFactor2D(t + 1, lift + who, gtsam.Rot2(value), noise))
+    settings = gtsam.LevenbergMarquardtParams()
+    settings.setRelativeErrorTol(1e-9)
+    found = gtsam.LevenbergMarquardtOptimizer(graph, initial, settings).optimize()
+    poses = [found.atPose2(i + 1) for i in range(len(poses))]
+    points = [found.atPoint2(lift + i) for i in range(len(points))]
+    return np.array([(p.x(), p.y(), p.theta()) for p in poses]), np.array(points)
+
+
+def motion(odometry, params):
+    """Sensor's motion [T, 3] over the intervals, and its covariance [T, 3, 3] in the frame at the
+    intervals' (predicted) end, where GTSAM has its residuals."""
+    with jax.enable_x64(True):
+        m = model(odometry, params)
+        m = type(m)(*(np.asarray(leaf, float) + np.zeros(len(odometry.dx)) for leaf in m))
+    c, s, zero = np.cos(m.chord - m.turn), np.sin(m.chord - m.turn), np.zeros(len(m.turn))
+    one = np.ones(len(m.turn))
+    # columns: noise along the chord, of the heading (with its sideways part), sideways
+    root = np.array([[c, -s * m.slope, -s], [s, c * m.slope, c], [zero, one, zero]])
+    root = root.transpose(2, 0, 1)
+    root = root * np.sqrt(np.column_stack([m.var_along, m.var_heading, m.var_rest]))[:, None]
+    robot = np.column_stack([m.length * np.cos(m.chord), m.length * np.sin(m.chord), m.turn])
+    mount = mounting(params)
+    moved = compose(compose(compose_inverse(mount), robot), mount)
+    root = to_sensor(mount) @ root
+    return moved, root @ root.transpose(0, 2, 1) + TINY**2 * np.eye(3)
+
+
+def prior(log, params):
+    """Covariance [3, 3] of the sensor's pose at the start, in its own frame."""
+    c, s = np.cos(log.start_pose[2]), np.sin(log.start_pose[2])
+    turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+    root = to_sensor(mounting(params)) @ turn
+    return root @ log.start_cov @ root.T + TINY**2 * np.eye(3)
+
+
+def mounting(params):
+    return np.array([[params.mount_x, params.mount_y, params.mount_yaw]], float)
+
+
+def to_sensor(mount):
+    """Adjoint [3, 3] that turns a small motion of the robot's frame into one of the sensor's."""
+    x, y, yaw = mount[0]
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, s, s * x - c * y], [-s, c, c * x + s * y], [0, 0, 1]])
+
+
+def compose(pose, offset):
+    """Poses [T, 3] after the offsets [T, 3] in their frames."""
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    x = pose[:, 0] + c * offset[:, 0] - s * offset[:, 1]
+    y = pose[:, 1] + s * offset[:, 0] + c * offset[:, 1]
+    return np.column_stack([x, y, wrap(pose[:, 2] + offset[:, 2])])
+
+
+def compose_inverse(pose):
+    """The poses [T, 3] that undo these."""
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    x, y = c * pose[:, 0] + s * pose[:, 1], c * pose[:, 1] - s * pose[:, 0]
+    return np.column_stack([-x, -y, -pose[:, 2]])
+
+
+def bearing_noise(odometry, params):
+    """Variance far away and variance x range^2 of the frames' bearings [T], inflated, and both not
+    inflated (the measurement is judged by its own noise)."""
+    with jax.enable_x64(True):
+        inflated = sensors.correlated(params, odometry)
+    ones = np.ones(len(odometry.dx))
+    return (
+        np.asarray(inflated.sigma_bearing, float) ** 2 * ones,
+        np.asarray(inflated.growth, float) ** 2 * ones,
+    )
+
+
+def inlier(residual, variance, noise, frame, params):
+    """Posterior probability [n] that a bearing is no clutter, which is uniform over the view."""
+    share = (noise[0] / params.sigma_bearing**2)[frame]  # what `correlated` multiplied by
+    variance = variance / share
+    normal = np.exp(-0.5 * residual**2 / variance) / np.sqrt(2 * np.pi * variance)
+    clutter = params.outlier / (params.view_max - params.view_min)
+    normal = (1 - params.outlier) * normal
+    return np.maximum(normal / (normal + clutter + 1e-300), 1e-9)
+
+
+def true_start(log, data):
+    """True poses [T, 3] at the frames, carried on by odometry where there are none."""
+    pose = truth_at(log.truth, data.time)
+    move = np.column_stack([data.odometry.dx, data.odometry.dy, data.odometry.dtheta])
+    last = np.array(log.start_pose)[None]
+    for i in range(len(pose)):
+        if not np.isfinite(pose[i]).all():
+            pose[i] = compose(last, move[i : i + 1])[0]
+        last = pose[i : i + 1]
+    return pose
+
+
+def triangulate(sensor, bearing, who, count):
+    """Points [L, 2] nearest, in angle, to the rays from sensor poses [n, 3] (least squares)."""
+    angle = sensor[:, 2] + bearing
+    normal = np.column_stack([-np.sin(angle), np.cos(angle)])
+    offset = (normal * sensor[:, :2]).sum(1)
+    points = np.zeros((count, 2))
+    for i in range(count):
+        rows = who == i
+        weight = np.ones(rows.sum())
+        for _ in range(5):
+            a, b = normal[rows] * weight[:, None], offset[rows] * weight
+            points[i] = np.linalg.lstsq(a, b, rcond=1e-6)[0]
+            weight = 1 / np.maximum(np.hypot(*(points[i] - sensor[rows, :2]).T), 0.3)
+    return points
+
+
+def errors(batch, log):
+    """Errors of a batch solution: `ate_m` aligned and not, and its landmarks, aligned as the path
+    is (`landmark_m`) and not; `scale` of the map over the true one."""
+    true = truth_at(log.truth, log.frame_time)
+    have = with_truth(true)
+    found = {
+        "ate_m": ate(batch.pose, true)[0],
+        "ate_unaligned_m": ate(batch.pose, true, align=False)[0],
+    }
+    if log.truth.landmarks is None:
+        return found
+    to_truth = align_se2(batch.pose[have, :2], true[have, :2])
+    for name, move in (("landmark_m", to_truth), ("landmark_unaligned_m", None)):
+        found[name] = map_error(batch.landmarks, batch.identity, log.truth, move)["rmse_m"]
+    places = dict(zip(log.truth.landmark_id.tolist(), log.truth.landmarks, strict=True))
+    rows = [i for i, who in enumerate(batch.identity.tolist()) if who in places]
+    there = np.array([places[int(who)] for who in batch.identity[rows]])
+    here = batch.landmarks[rows]
+    return found | {"scale": float(np.sqrt(here.var(0).sum() / there.var(0).sum()))}
