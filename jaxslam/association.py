@@ -1,7 +1,8 @@
-"""Which landmark each measurement of a frame came from: `known` or `maximum_likelihood`.
+"""Which landmark each measurement of a frame came from.
 
-Works on blocks of n particles, on arrays [K, n] of slots and log densities. Every measurement
-takes the slot of greatest density, if that beats the alternatives ("new" and "clutter").
+`maximum_likelihood`: the slot of greatest density, if that beats the alternatives ("new" and
+"clutter"). `sampled`: slot or alternative drawn, each with its share of the sum of all densities.
+`known`: as the log says. Works on blocks of n particles, on arrays [K, n] of slots and densities.
 """
 
 import jax
@@ -13,15 +14,20 @@ from jaxslam.landmarks import score
 NEW, CLUTTER, PADDING = -1, -2, -3
 
 
-def associate(config, scorer, measurements, new, clutter, params):
-    """Slots [K, n] matched by the measurements, or `NEW`, `CLUTTER`, `PADDING`.
+def associate(config, scorer, measurements, new, clutter, params, picks=None):
+    """Slots [K, n] matched by the measurements, or `NEW`, `CLUTTER`, `PADDING`; and the log
+    probability [n] with which they were drawn (0 where nothing is drawn).
 
     `scorer`: prediction of every slot, [M, n]. `new` [K] and `clutter` []: log densities of the
-    alternatives (`clutter` -inf when the configuration has none). No gradient flows through.
+    alternatives (`clutter` -inf when the configuration has none). `picks` [K, n]: uniforms behind
+    the draws of `sampled`. No gradient flows through.
     """
     scorer, new, clutter, params = jax.lax.stop_gradient((scorer, new, clutter, params))
     new = jnp.broadcast_to(new, measurements.valid.shape)
-    if config.association == "known":
+    log_choice = jnp.zeros_like(scorer.constant[0])
+    if config.association == "sampled":
+        slot, log_choice = _sampled(config, scorer, measurements, new, clutter, params, picks)
+    elif config.association == "known":
         slot = _known(config, scorer, measurements, clutter, params)
     else:
         # Padding wants no landmark, so that it takes none from a measurement.
@@ -29,7 +35,54 @@ def associate(config, scorer, measurements, new, clutter, params):
         slot = _maximum_likelihood(config, scorer, measurements, threshold, params)
         other = jnp.where(new >= clutter, NEW, CLUTTER)
         slot = jnp.where(slot < 0, other[:, None], slot)
-    return jnp.where(measurements.valid[:, None], slot, PADDING)
+    return jnp.where(measurements.valid[:, None], slot, PADDING), log_choice
+
+
+def _sampled(config, scorer, measurements, new, clutter, params, picks):
+    """Slots [K, n] drawn one measurement after the other, and the log probability [n] of all.
+
+    With `exclusive` a slot that an earlier measurement took has no share any more: drawn without
+    replacement. The weight then makes up for the order: likelihoods over the probability of the
+    draw are the product of the sums that were drawn from.
+    """
+    value, cov = jnp.asarray(measurements.value).T, jnp.asarray(measurements.cov).T
+    slots, lanes = scorer.constant.shape
+    kind = scorer.constant.dtype
+
+    def draw(carry, k):
+        taken, log_choice = carry
+        table = score(
+            config.sensor, scorer, tuple(v[k] for v in value), tuple(c[k] for c in cov), params
+        )
+        table = jnp.where(taken, -jnp.inf, table)
+        top = jnp.maximum(table.max(0), jnp.maximum(new[k], clutter))
+        share, other = jnp.exp(table - top), jnp.exp(new[k] - top)
+        total = share.sum(0) + other + jnp.exp(clutter - top)
+        mark = picks[k] * total
+
+        # The slot in which the running sum passes the mark; "new" and "clutter" come after all.
+        def walk(m, found):
+            below, slot = found
+            slot = jnp.where((slot == CLUTTER) & (mark < below + share[m]), m, slot)
+            return below + share[m], slot
+
+        none = jnp.full(lanes, CLUTTER, jnp.int32)
+        below, slot = jax.lax.fori_loop(0, slots, walk, (jnp.zeros(lanes, kind), none))
+        # Rounding may leave the mark beyond everything: without clutter that is "new".
+        last = (mark < below + other) | (clutter == -jnp.inf)
+        slot = jnp.where((slot == CLUTTER) & last, NEW, slot)
+        chosen = jnp.where(jnp.arange(slots)[:, None] == slot, share, 0.0).sum(0)
+        chosen = jnp.where(slot == NEW, other, chosen)
+        chosen = jnp.where(slot == CLUTTER, jnp.exp(clutter - top), chosen)
+        log_choice = log_choice + jnp.where(measurements.valid[k], jnp.log(chosen / total), 0.0)
+        if config.exclusive:
+            here = jnp.arange(slots)[:, None] == slot
+            taken = taken | (here & measurements.valid[k])
+        return (taken, log_choice), slot
+
+    start = jnp.zeros((slots, lanes), bool), jnp.zeros(lanes, kind)
+    (_, log_choice), slot = jax.lax.scan(draw, start, jnp.arange(len(new)))
+    return slot, log_choice
 
 
 def _known(config, scorer, measurements, clutter, params):

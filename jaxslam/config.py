@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 SENSORS = ("position", "range_bearing", "bearing")
-ASSOCIATIONS = ("maximum_likelihood", "known")
-PROPOSALS = ("prior",)
+ASSOCIATIONS = ("maximum_likelihood", "known", "sampled")
+PROPOSALS = ("prior", "informed")
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import association, landmarks, motion, resampling, sensors
+from jaxslam import landmarks, observation, resampling
 from jaxslam.association import CLUTTER, NEW
 from jaxslam.geometry import wrap
 from jaxslam.landmarks import Landmarks
+from jaxslam.observation import Chance
 
 
 class State(NamedTuple):
@@ -38,11 +39,12 @@ class Info(NamedTuple):
     """What is known about one step; counts are over all particles.
 
     `pose` [3, N] and `log_weight` [N] of all particles, before resampling. `match` [K, N]: slot
-    matched, or -1 new, -2 clutter, -3 padding. `birth`
-    [K, N]: the same as births (`Landmarks.birth`) of the landmarks matched. `ancestors` [N]: which
-    of these particles each particle after resampling continues. `new`: landmarks that the
-    best particle began. `overflow`: landmarks lost for want of a slot. `nonfinite`: particles whose
-    weight became NaN or infinite. `degenerate`: no weight was left, all were made equal.
+    matched, or -1 new, -2 clutter, -3 padding. `birth` [K, N]: the same as births
+    (`Landmarks.birth`) of the landmarks matched. `log_choice` [N]: log probability with which the
+    matches were drawn (0: they were not). `ancestors` [N]: which of these particles each particle
+    after resampling continues. `new`: landmarks that the best particle began. `overflow`: landmarks
+    lost for want of a slot. `nonfinite`: particles whose weight became NaN or infinite.
+    `degenerate`: no weight was left, all were made equal.
     """
 
     pose: jax.Array
@@ -54,6 +56,7 @@ class Info(NamedTuple):
     ancestors: jax.Array
     match: jax.Array
     birth: jax.Array
+    log_choice: jax.Array
     new: jax.Array
     outliers: jax.Array
     overflow: jax.Array
@@ -96,10 +99,14 @@ def start_draws(key, config):
 
 
 def draws(key, step, config):
-    """Standard normals [3, N] and the uniform behind a step, set by its absolute number alone."""
+    """`Chance` of a step, set by its absolute number alone."""
     move, choose = jax.random.split(jax.random.fold_in(key, step))
     normals = jax.random.normal(move, (3, config.particles), float)
-    return normals, jax.random.uniform(choose, (), float)
+    uniform = jax.random.uniform(choose, (), float)
+    if config.association != "sampled":
+        return Chance(normals, uniform)
+    shape = config.measurements, config.particles
+    return Chance(normals, uniform, jax.random.uniform(jax.random.fold_in(choose, 1), shape, float))
 
 
 @partial(jax.jit, static_argnames="config")
@@ -110,13 +117,9 @@ def step(key, state, odometry, measurements, params, config):
 
 
 def advance(chance, state, odometry, measurements, params, config):
-    """`step` with its random numbers given: `chance` is the (normals, uniform) of `draws`."""
-    normals, uniform = chance
-    pose = jnp.stack(motion.sample(state.pose, odometry, params, normals))
-    measurements = sensors.rescaled(measurements, params)
-    noise = sensors.correlated(params, odometry)
-    world, density, match, counts = _observe(
-        pose, state.landmarks, measurements, params, noise, config, state.step
+    """`step` with its random numbers given: `chance` is that of `draws`."""
+    pose, world, density, match, log_choice, counts = observation.observe(
+        state.pose, state.landmarks, chance, odometry, measurements, params, config, state.step
     )
     # A pose that is not a number fits nothing, which would count as new landmarks: no weight.
     sound = jnp.isfinite(pose).all(0)
@@ -128,7 +131,7 @@ def advance(chance, state, odometry, measurements, params, config):
     threshold = config.resample_threshold
     wanted = measurements.active & ((ess < threshold * config.particles) | (threshold >= 1))
     moved = State(pose, world, log_weight, state.step + 1)
-    resampled, ancestors = _resample(moved, wanted, uniform, config)
+    resampled, ancestors = _resample(moved, wanted, chance.uniform, config)
     birth = jnp.take_along_axis(world.birth, jnp.maximum(match, 0), 0)
     info = Info(
         pose=pose,
@@ -140,6 +143,7 @@ def advance(chance, state, odometry, measurements, params, config):
         ancestors=ancestors,
         match=match,
         birth=jnp.where(match >= 0, birth, match),
+        log_choice=log_choice,
         new=jnp.sum(match[:, estimate.best] == NEW),
         outliers=jnp.sum(match == CLUTTER),
         overflow=counts[0].sum(),
@@ -159,84 +163,6 @@ def run(key, state, odometry, measurements, params, config, summarise=lambda inf
         return state, summarise(info)
 
     return jax.lax.scan(body, state, (odometry, measurements))
-
-
-def _observe(pose, world, measurements, params, noise, config, number):
-    """Associate, weigh and update, block by block so that a block's temporaries stay in cache.
-
-    `noise`: `params` whose measurement noise allows for what the last frame told already.
-    Returns the map, log densities [N], matches [K, N], and counts [2, N]: overflow, forgotten.
-    """
-    n = config.particles
-    size = _block_size(config)
-    # Outside the loop: XLA would work out cosine and sine again for every landmark.
-    sensor_pose = sensors.pose_of(tuple(pose), params)
-    carry = (world, *_nothing(config, n, pose.dtype))
-
-    def block(i, carry):
-        start = i * size
-        poses, mine = jax.tree.map(
-            lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, size, -1),
-            (sensor_pose, carry[0]),
-        )
-        # Inside a branch the slices are arrays of their own. Fused into the arithmetic, in-place
-        # reading and writing of the large arrays stops its vectorisation: ten times slower.
-        done = jax.lax.cond(
-            measurements.active,
-            lambda poses, mine: _observe_block(
-                poses, mine, measurements, params, noise, config, number
-            ),
-            lambda poses, mine: (mine, *_nothing(config, size, pose.dtype)),
-            poses,
-            mine,
-        )
-        return jax.tree.map(
-            lambda all_, new: jax.lax.dynamic_update_slice_in_dim(all_, new, start, -1), carry, done
-        )
-
-    return jax.lax.fori_loop(0, n // size, block, carry)
-
-
-def _nothing(config, size, dtype):
-    """What a frame without a look adds: log densities, matches, counts."""
-    match = jnp.full((config.measurements, size), association.PADDING, jnp.int32)
-    return jnp.zeros(size, dtype), match, jnp.zeros((2, size), jnp.int32)
-
-
-def _block_size(config):
-    """The largest divisor of the number of particles that is no larger than the block."""
-    n = config.particles
-    return next(size for size in range(min(config.block, n), 0, -1) if n % size == 0)
-
-
-def _observe_block(sensor_pose, before, measurements, params, noise, config, step_number):
-    """The frame's measurements on one block of particles, as `_observe`."""
-    parts = tuple(before.anchor) if before.anchor is not None else None
-    seen = sensors.observe(config.sensor, sensor_pose, tuple(before.mean), parts, params)
-    if not config.clutter:
-        params, noise = (p._replace(outlier=jnp.zeros(())) for p in (params, noise))
-    scorer = landmarks.scorer(config.sensor, seen, before, jnp.log1p(-params.outlier))
-    new = sensors.log_new_density(config.sensor, tuple(measurements.value.T), params)
-    clutter = sensors.log_clutter_density(config.sensor, params)
-    match = association.associate(config, scorer, measurements, new, clutter, params)
-    world, density = landmarks.update_matched(
-        config.sensor, sensor_pose, before, match, measurements, noise
-    )
-    density = density + jnp.where(match == NEW, new[:, None], 0).sum(0)
-    if config.clutter:
-        density = density + jnp.where(match == CLUTTER, clutter, 0).sum(0)
-    world, overflow = landmarks.create(
-        config, sensor_pose, world, match, measurements, params, step_number
-    )
-    forgotten = jnp.zeros_like(overflow)
-    if config.forgetting:
-        world, forgotten = landmarks.existence(world, seen, params)
-    return (
-        landmarks.settle(world),
-        density,
-        match,
-        jnp.stack([overflow, forgotten]).astype(jnp.int32),
-    )
 
 
 def _weigh(log_weight, density):

@@ -52,18 +52,27 @@ def empty(config, dtype):
     )
 
 
-def scorer(sensor, seen, landmarks, inlier):
-    """`Scorer` of every slot; empty slots score -inf. `inlier`: log probability added to all."""
+def scorer(sensor, seen, landmarks, inlier, by_u=None):
+    """`Scorer` of every slot; empty slots score -inf. `inlier`: log probability added to all.
+
+    `by_u`: rows of the predicted measurement by the pose's own standard normals (see `proposal`),
+    where the pose is not known exactly.
+    """
     factor = tuple(landmarks.factor)
     occupied = landmarks.count > 0
     spread = [geometry.transpose_times(factor, row) for row in seen.rows]
-    s00 = spread[0][0] ** 2 + spread[0][1] ** 2
+    if by_u is not None:
+        spread = [row + more for row, more in zip(spread, by_u, strict=True)]
+
+    def product(i, j):
+        return sum(a * b for a, b in zip(spread[i], spread[j], strict=True))
+
+    s00 = product(0, 0)
     if sensor == "bearing":
         s00 = jnp.where(occupied, s00 + seen.noise[0], 1.0)
         constant = -0.5 * (jnp.log(s00) + sensors.LOG_2PI)
         return Scorer(seen.value, (-0.5 / s00,), jnp.where(occupied, inlier + constant, -jnp.inf))
-    s01 = spread[0][0] * spread[1][0] + spread[0][1] * spread[1][1]
-    s11 = spread[1][0] ** 2 + spread[1][1] ** 2
+    s01, s11 = product(0, 1), product(1, 1)
     if sensor == "position":
         constant = jnp.where(occupied, inlier - sensors.LOG_2PI, -jnp.inf)
         return Scorer(seen.value, (s00, s01, s11), constant)

@@ -79,6 +79,17 @@ def sample(pose, odometry, params, normals):
     )
 
 
+def axes(pose, odometry, params):
+    """Derivatives of `sample`'s pose by its three normals, at zero: three (x, y, heading)."""
+    m = model(odometry, params)
+    c, s = jnp.cos(pose[2] + m.chord), jnp.sin(pose[2] + m.chord)
+    along, turn, rest = _root(m.var_along), _root(m.var_heading), _root(m.var_rest)
+    side = m.slope * turn
+    zero = jnp.zeros_like(c)
+    by_along, by_rest = (c * along, s * along, zero), (-s * rest, c * rest, zero)
+    return by_along, (-s * side, c * side, turn + zero), by_rest
+
+
 def log_density(after, before, odometry, params):
     """log p(after | before, odometry) per m^2 rad; needs noise in every direction (the floors)."""
     m = model(odometry, params)

@@ -56,7 +56,7 @@ def test_exclusive_matching_takes_the_best_pair_first(x64, spread):
     config = Config(sensor="bearing", measurements=K, landmarks=M, particles=N)
     measurements, scorer, table, valid = case(int(100 * spread), spread)
     new = jnp.full(K, -0.02)
-    match = associate(config, scorer, measurements, new, -0.5, default_params("bearing"))
+    match, _ = associate(config, scorer, measurements, new, -0.5, default_params("bearing"))
     conflicts = 0
     for i in range(N):
         expected = greedy(table[:, :, i], np.full(K, -0.02))
@@ -72,15 +72,15 @@ def test_the_order_of_the_measurements_does_not_matter(x64):
     order = np.array([3, 0, 4, 1, 2])
     shuffled = jax.tree.map(lambda leaf: leaf[order] if leaf.ndim else leaf, measurements)
     params, new = default_params("bearing"), jnp.full(K, -0.1)
-    one = associate(config, scorer, measurements, new, -9.0, params)
-    other = associate(config, scorer, shuffled, new, -9.0, params)
+    one, _ = associate(config, scorer, measurements, new, -9.0, params)
+    other, _ = associate(config, scorer, shuffled, new, -9.0, params)
     np.testing.assert_array_equal(one[order], other)
 
 
 def test_not_exclusive_every_measurement_takes_its_best(x64):
     config = Config(sensor="bearing", measurements=K, landmarks=M, particles=N, exclusive=False)
     measurements, scorer, table, valid = case(2, 0.5)
-    match = associate(config, scorer, measurements, jnp.full(K, -5.0), -9.0, default_params())
+    match, _ = associate(config, scorer, measurements, jnp.full(K, -5.0), -9.0, default_params())
     expected = np.where(valid[:, None], table.argmax(1), PADDING)
     np.testing.assert_array_equal(match, expected)
     assert any(len(set(column[valid])) < valid.sum() for column in np.asarray(match).T)
@@ -91,9 +91,9 @@ def test_what_fits_nothing_is_new_or_clutter_whichever_is_likelier():
     scorer = scorer_of(np.zeros((1, 1)), np.ones((1, 1), bool))
     far = frame([1.0, 1.5])
     new = jnp.array([-0.2, -0.9])
-    match = associate(config, scorer, far, new, -0.3, default_params())
+    match, _ = associate(config, scorer, far, new, -0.3, default_params())
     np.testing.assert_array_equal(match[:, 0], [NEW, CLUTTER])
-    match = associate(config, scorer, far, jnp.array([-0.6, -3.0]), -3.0, default_params())
+    match, _ = associate(config, scorer, far, jnp.array([-0.6, -3.0]), -3.0, default_params())
     np.testing.assert_array_equal(match[:, 0], [0, NEW])  # one landmark, and it goes to the nearer
 
 
@@ -101,7 +101,7 @@ def test_known_identities_are_slots():
     config = Config(sensor="bearing", association="known", measurements=5, landmarks=3, particles=1)
     scorer = scorer_of(np.zeros((3, 1)), np.array([[True], [True], [False]]))
     measurements = frame([0.1, 3.0, 0.0, 0.0, 0.0], [1, 0, 2, 7, 1], [True] * 4 + [False])
-    match = associate(config, scorer, measurements, jnp.full(5, -1.0), -2.0, default_params())
+    match, _ = associate(config, scorer, measurements, jnp.full(5, -1.0), -2.0, default_params())
     # fits; clutter is likelier; slot empty; no such slot; padding
     np.testing.assert_array_equal(match[:, 0], [1, CLUTTER, NEW, NEW, PADDING])
 
@@ -126,7 +126,7 @@ def test_slots_that_are_passed_over_could_not_have_matched(x64, seed, scatter):
     measurements = frame(np.zeros(k))._replace(value=jnp.asarray(value))
     config = Config(measurements=k, landmarks=slots, particles=lanes, exclusive=False)
     params, threshold = default_params(), jnp.full(k, -1.0)
-    match = associate(config, scorer, measurements, threshold, -9.0, params)
+    match, _ = associate(config, scorer, measurements, threshold, -9.0, params)
     columns = tuple(jnp.asarray(value[:, i, None, None]) for i in range(2))
     table = np.asarray(score("range_bearing", scorer, columns, None, params))
     expected = np.where(table.max(1) > -1, table.argmax(1), NEW)

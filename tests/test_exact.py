@@ -89,12 +89,16 @@ def kalman(odometry, measurements, params):
     return log_z, np.concatenate([mean[:2], landmarks.ravel()])
 
 
-@pytest.mark.parametrize("threshold", [0.0, 0.5, 1.0])
-def test_evidence_and_means_against_a_joint_kalman_filter(x64, threshold):
+@pytest.mark.parametrize(
+    ("threshold", "proposal"),
+    [(0.0, "prior"), (0.5, "prior"), (1.0, "prior"), (0.0, "informed"), (1.0, "informed")],
+)
+def test_evidence_and_means_against_a_joint_kalman_filter(x64, threshold, proposal):
     odometry, measurements, params = problem()
     config = Config(
         sensor="position",
         association="known",
+        proposal=proposal,
         particles=10,
         landmarks=LANDMARKS,
         measurements=2,

@@ -86,8 +86,8 @@ def test_rotating_and_translating_the_world_moves_everything_along(x64, log, sen
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_mirroring_the_world_mirrors_the_answer(x64, log, sensor):
     config, params, data = setup(log, sensor)
-    normals, uniform = chances(config)
-    state, info = drive(config, params, data, (normals, uniform))
+    chance = chances(config)
+    state, info = drive(config, params, data, chance)
     flip = jnp.array([1.0, -1.0, -1.0])[None, :, None]
     odometry, measurements = data
     odometry = odometry._replace(dy=-odometry.dy, dtheta=-odometry.dtheta)
@@ -102,7 +102,7 @@ def test_mirroring_the_world_mirrors_the_answer(x64, log, sensor):
         view_max=-params.view_min,
     )
     mirrored, mirrored_info = drive(
-        config, params, (odometry, measurements), (normals * flip, uniform)
+        config, params, (odometry, measurements), chance._replace(normals=chance.normals * flip)
     )
     np.testing.assert_array_equal(info.ancestors, mirrored_info.ancestors)
     np.testing.assert_array_equal(info.match, mirrored_info.match)

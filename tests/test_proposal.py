@@ -1,0 +1,217 @@
+"""The informed proposal and drawn associations: derivatives, exact answers, and the prior proposal
+with very many particles."""
+
+from itertools import product
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_exact import START, START_COV, STEPS, problem
+
+from jaxslam import filter as fastslam
+from jaxslam import motion, proposal, sensors
+from jaxslam.association import CLUTTER, NEW
+from jaxslam.config import SENSORS, Config, default_params
+from jaxslam.odometry import Odometry
+from jaxslam.sensors import Measurements
+
+ODOMETRY = Odometry(0.3, 0.05, 0.2, 0.32, 0.25, 0.5, 0.4, 0.1)
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_rows_are_the_derivatives_by_the_motions_normals(x64, sensor):
+    params = default_params(sensor)._replace(mount_x=0.2, mount_y=-0.1, mount_yaw=0.3)
+    before = (0.4, -0.3, 0.7)
+    mean = (0.9, 0.35) if sensor == "bearing" else (2.0, 1.5)
+    anchor = (-0.6, 0.2) if sensor == "bearing" else None
+
+    def pose_of(u):
+        return motion.sample(before, ODOMETRY, params, u)
+
+    def predicted(u):
+        sensor_pose = sensors.pose_of(pose_of(u), params)
+        return jnp.stack(sensors.observe(sensor, sensor_pose, mean, anchor, params).value)
+
+    zero = jnp.zeros(3)
+    sensor_pose = sensors.pose_of(pose_of(zero), params)
+    axes = proposal.axes(before, pose_of(zero), sensor_pose, ODOMETRY, params)
+    found = proposal.rows(sensor, sensor_pose, axes, mean, anchor, predicted(zero))
+    np.testing.assert_allclose(np.array(found), jax.jacobian(predicted)(zero), atol=1e-12)
+
+
+def test_the_normal_after_updates_is_bayes_rule(x64):
+    rng = np.random.default_rng(0)
+    n, count = 4, 5
+    h, rest = rng.normal(size=(count, 3, n)), rng.normal(size=(count, n))
+    variance = rng.uniform(0.01, 2.0, (count, n))
+    zero, one = jnp.zeros(n), jnp.ones(n)
+    whitened = proposal.Whitened(
+        (zero,) * 3, ((one, zero, zero), (zero, one, zero), (zero, zero, one)), zero
+    )
+    for k in range(count):
+        matched = jnp.asarray(k != 2)
+        whitened = proposal._update(whitened, tuple(h[k]), rest[k], variance[k], matched)
+    for i in range(n):
+        used = [0, 1, 3, 4]
+        information = np.eye(3) + sum(
+            np.outer(h[k, :, i], h[k, :, i]) / variance[k, i] for k in used
+        )
+        cov = np.linalg.inv(information)
+        mean = cov @ sum(h[k, :, i] * rest[k, i] / variance[k, i] for k in used)
+        root = np.array(whitened.root)[..., i]
+        np.testing.assert_allclose(np.array(whitened.mean)[:, i], mean, atol=1e-12)
+        np.testing.assert_allclose(root @ root.T, cov, atol=1e-12)
+        assert whitened.log_det[i] == pytest.approx(0.5 * np.log(np.linalg.det(cov)), abs=1e-12)
+
+
+def enumerated(odometry, measurements, params, steps):
+    """log Z with hidden associations: the sum over all of them, each by a joint Kalman filter.
+
+    A measurement is of any landmark begun so far that no other of its frame is of, or begins one,
+    or is clutter.
+    """
+    new = np.log1p(-params.outlier) + np.log(params.density_new)
+    clutter = float(sensors.log_clutter_density("position", params))
+    heading = START[2] + np.concatenate([[0.0], np.cumsum(odometry.dtheta)])
+    branches = [(0.0, START[:2], START_COV[:2, :2])]
+    for t in range(steps):
+        o = Odometry(*(float(part[t]) for part in odometry))
+        angle = heading[t] + np.arctan2(o.dy, o.dx)
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        floor = params.floor_tran**2 * o.duration
+        noise = turn @ np.diag([params.err_tran**2 * o.distance + floor, floor]) @ turn.T
+        c, s = np.cos(heading[t + 1]), np.sin(heading[t + 1])
+        rotation = np.array([[c, s], [-s, c]])
+        ks, grown = np.flatnonzero(measurements.valid[t]), []
+        for log_z, mean, cov in branches:
+            mean, cov = mean.copy(), cov.copy()
+            mean[:2] += turn @ [np.hypot(o.dx, o.dy), 0]
+            cov[:2, :2] += noise
+            known = len(mean) // 2 - 1
+            for choice in product([*range(known), NEW, CLUTTER], repeat=len(ks)):
+                taken = [c for c in choice if c >= 0]
+                if len(set(taken)) == len(taken):
+                    grown.append(branch(log_z, mean, cov, choice, ks, t, rotation, measurements,
+                                        params, new, clutter))  # fmt: skip
+        branches = grown
+    return np.logaddexp.reduce([log_z for log_z, *_ in branches])
+
+
+def branch(log_z, mean, cov, choice, ks, t, rotation, measurements, params, new, clutter):
+    for k, slot in zip(ks, choice, strict=True):
+        z = measurements.value[t, k]
+        xx, xy, yy = measurements.cov[t, k]
+        noise = np.array([[xx, xy], [xy, yy]])
+        if slot == CLUTTER:
+            log_z += clutter
+        elif slot == NEW:
+            log_z += new
+            size = len(mean)
+            grow = np.vstack([np.eye(size), np.eye(2, size)])
+            mean = np.concatenate([mean, mean[:2] + rotation.T @ z])
+            cov = grow @ cov @ grow.T
+            cov[size:, size:] += rotation.T @ noise @ rotation
+        else:
+            h = np.zeros((2, len(mean)))
+            h[:, 2 * slot + 2 : 2 * slot + 4], h[:, :2] = rotation, -rotation
+            rest, s = z - h @ mean, h @ cov @ h.T + noise
+            gain = cov @ h.T @ np.linalg.inv(s)
+            log_z += np.log1p(-params.outlier) - 0.5 * (
+                rest @ np.linalg.solve(s, rest) + np.log(np.linalg.det(2 * np.pi * s))
+            )
+            mean, cov = mean + gain @ rest, cov - gain @ h @ cov
+    return log_z, mean, cov
+
+
+@pytest.mark.parametrize("kind", ["prior", "informed"])
+def test_drawn_associations_give_the_evidence_of_all(x64, kind):
+    odometry, measurements, params = problem()
+    steps, runs = 3, 30_000
+    odometry, measurements = jax.tree.map(lambda leaf: leaf[:steps], (odometry, measurements))
+    params = params._replace(outlier=0.2, density_new=0.05, view_range=4.0)
+    config = Config(
+        sensor="position", association="sampled", proposal=kind, particles=6, landmarks=6,
+        measurements=2, resample_threshold=0.7, forgetting=False,
+    )  # fmt: skip
+    log_z = enumerated(odometry, measurements, params, steps)
+    data = jax.tree.map(jnp.asarray, (odometry, measurements, params))
+
+    @jax.jit
+    @jax.vmap
+    def evidence(key):
+        start_key, key = jax.random.split(key)
+        state = fastslam.init(config, start_key, START, START_COV)
+        state, info = fastslam.run(key, state, *data, config)
+        mixed = (info.match[-1, 0] != info.match[-1, 0, 0]).any()
+        return info.log_evidence.sum(), info.overflow.sum(), mixed, info.log_choice.min()
+
+    found = evidence(jax.random.split(jax.random.key(5), runs))
+    log_zhat, overflow, mixed, log_choice = map(np.asarray, found)
+    assert overflow.sum() == 0 and mixed.mean() > 0.3 and log_choice.min() < -1
+    ratio = np.exp(log_zhat - log_z)
+    error = ratio.std() / np.sqrt(runs)
+    assert abs(ratio.mean() - 1) < 4 * error and error < 0.01
+
+
+@pytest.mark.parametrize("sensor", ["bearing", "range_bearing"])
+def test_few_informed_particles_agree_with_very_many_of_the_prior(x64, sensor):
+    """Where nothing is linear: log evidence and mean pose within what sampling allows."""
+    steps, k, rng = 5, 4, np.random.default_rng(2)
+    marks = np.array([[2.0, 1.0], [1.0, -1.5], [3.0, -0.5], [-1.0, 1.5]])
+    turn = np.full(steps, 0.25)
+    odometry = Odometry(
+        np.full(steps, 0.4), np.zeros(steps), turn, np.full(steps, 0.4), turn,
+        np.full(steps, 1.0), np.full(steps, 0.5), np.full(steps, 1 / 12),
+    )  # fmt: skip
+    params = default_params(sensor)._replace(
+        err_tran=0.15, err_rot=0.2, err_drift=0.1, sigma_bearing=0.04, growth=0.0, sigma_range=0.1
+    )
+    pose, values = np.zeros(3), []
+    for t in range(steps):
+        row = Odometry(*(part[t] for part in odometry))
+        pose = np.array(motion.sample(pose, row, params, rng.normal(size=3)))
+        off = marks - pose[:2]
+        bearing = np.arctan2(off[:, 1], off[:, 0]) - pose[2] + 0.04 * rng.normal(size=k)
+        r = np.hypot(*off.T) + 0.1 * rng.normal(size=k)
+        columns = (bearing, np.zeros(k)) if sensor == "bearing" else (r, bearing)
+        values.append(np.stack(columns, 1))
+    measurements = Measurements(
+        np.array(values), np.zeros((steps, k, 3)), np.tile(np.arange(k, dtype=np.int32), (steps, 1)),
+        np.ones((steps, k), bool), np.ones(steps, bool),
+    )  # fmt: skip
+    data = jax.tree.map(jnp.asarray, (odometry, measurements, params))
+    factor = np.tile([[0.02], [0.0], [0.02]], (1, k))
+    given = [marks.T, factor, None]
+    if sensor == "bearing":
+        given = [np.stack([np.arctan2(*marks.T[::-1]), 1 / np.hypot(*marks.T)]), factor,
+                 np.zeros((2, k))]  # fmt: skip
+
+    def runs(kind, particles, count):
+        config = Config(
+            sensor=sensor, association="known", proposal=kind, particles=particles, landmarks=k,
+            measurements=k, clutter=False, resample_threshold=0.5,
+        )  # fmt: skip
+
+        @jax.jit
+        def one(key):
+            state = fastslam.init(config, key, landmarks_given=[g for g in given if g is not None])
+            state, info = fastslam.run(key, state, *data, config)
+            return info.log_evidence.sum(), info.estimate.mean[-1], info.ess.min()
+
+        found = [one(key) for key in jax.random.split(jax.random.key(1), count)]
+        return [np.array(part) for part in zip(*found, strict=True)]
+
+    (many_z, many_pose, _), (few_z, few_pose, ess) = (
+        runs("prior", 50_000, 8),
+        runs("informed", 250, 30),
+    )
+    error = np.hypot(many_z.std() / np.sqrt(8), few_z.std() / np.sqrt(30))
+    mean = [np.log(np.mean(np.exp(z - many_z.mean()))) for z in (many_z, few_z)]
+    assert abs(mean[0] - mean[1]) < 4 * error and error < 0.1
+    spread = np.sqrt(many_pose.var(0) / 8 + few_pose.var(0) / 30)
+    assert (np.abs(many_pose.mean(0) - few_pose.mean(0)) < 4 * spread + 1e-4).all()
+    assert spread.max() < 0.01
+    # The prior with as few particles is far worse: it is not all the same.
+    prior_z, _, prior_ess = runs("prior", 250, 30)
+    assert prior_z.std() > 2 * few_z.std() and prior_ess.mean() < ess.mean() / 2
