@@ -1,8 +1,7 @@
 """A whole run: a `Log` in, a `Result` out."""
 
+import dataclasses
 import time
-from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import jax
@@ -11,24 +10,16 @@ import numpy as np
 
 from jaxslam import filter as fastslam
 from jaxslam import landmarks as maps
-from jaxslam.config import Config, Params, default_params
+from jaxslam.config import Config, default_params
 from jaxslam.frames import frames
-from jaxslam.log import NOT_USED, Log
 from jaxslam.odometry import dead_reckoning
 from jaxslam.paramfile import validate
+from jaxslam.result import MapEstimate, Result
+from jaxslam.smoothing import Lineage, Tree, ancestral, lineage
 
-CHUNK = 256  # frames per compiled scan: one compilation serves logs of every length
-
-
-class MapEstimate(NamedTuple):
-    """L landmarks: `id` [L], world `mean` [L, 2] m and `cov` [L, 3] (xx, xy, yy) m^2, times seen
-    `n` [L], and the log's `identity` [L] (-1 where identities were hidden)."""
-
-    id: np.ndarray
-    mean: np.ndarray
-    cov: np.ndarray
-    n: np.ndarray
-    identity: np.ndarray
+CHUNK = 256  # frames per compiled scan, at most: one compilation serves logs of every length
+CHUNK_BYTES = 2**28  # what a chunk may hand over, at most
+TREE_BYTES = 2**31  # what the genealogy may take; beyond that it is given up
 
 
 class Summary(NamedTuple):
@@ -49,78 +40,12 @@ class Summary(NamedTuple):
     survivor: jax.Array
 
 
-@dataclass(frozen=True)
-class Result:
-    """A run's estimates, frame by frame, T frames.
+class Past(NamedTuple):
+    """What the genealogy needs of every step, of all particles (`filter.Info`)."""
 
-    `time` int64 [T] ns. `pose` [T, 3] (x, y, heading): filtered mean, m and rad, in the frame of
-    the log's start pose; `cov` [T, 3, 3]. `ess` [T]; `resampled` [T]; `new` [T]: landmarks begun by
-    the best particle; `overflow`, `forgotten`, `outliers` [T]: mean number per particle;
-    `log_evidence` [T]; `nonfinite`, `degenerate` [T]: flags of `filter.Info`. `match` [T, K]: what
-    the best particle took each measurement for (frame * K + k of the measurement that began the
-    landmark, or -1 new, -2 clutter, -3 padding), `row` [T, K]: the measurement's row in the log.
-    `landmarks`: the map at the end. `dead_reckoning` [T, 3]: odometry alone. `dropped`: rows left
-    out, by reason.
-    """
-
-    log: Log
-    config: Config
-    params: Params
-    seed: int
-    time: np.ndarray
-    pose: np.ndarray
-    cov: np.ndarray
-    ess: np.ndarray
-    resampled: np.ndarray
-    new: np.ndarray
-    overflow: np.ndarray
-    outliers: np.ndarray
-    forgotten: np.ndarray
-    log_evidence: np.ndarray
-    nonfinite: np.ndarray
-    degenerate: np.ndarray
-    match: np.ndarray
-    row: np.ndarray
-    landmarks: MapEstimate
-    dead_reckoning: np.ndarray
-    seconds: float
-    compile_seconds: float
-    dropped: dict[str, int]
-
-    @property
-    def log_likelihood(self):
-        """Log evidence of the whole log, nats."""
-        return float(np.sum(self.log_evidence, dtype=float))
-
-    @cached_property
-    def flags(self):
-        """One line for everything that was lost or went wrong; empty when nothing did."""
-        lines = [f"{count} measurements left out: {why}" for why, count in self.dropped.items()]
-        lines += [
-            f"{count} rows skipped by the reader: {why}"
-            for why, count in self.log.skipped.items()
-            if not why.startswith(NOT_USED)
-        ]
-        lost = float(np.sum(self.overflow))
-        if lost > 0:
-            frame = int(np.flatnonzero(self.overflow)[0])
-            lines.append(
-                f"the map was full from frame {frame} on: {lost:.1f} landmarks lost per particle; "
-                f"more than {self.config.landmarks} landmark slots are needed"
-            )
-        if np.any(self.nonfinite):
-            lines.append(f"{int(np.sum(self.nonfinite))} particle weights were not finite")
-        if np.any(self.degenerate):
-            lines.append(f"all weights were zero in {int(np.sum(self.degenerate))} frames")
-        if not (np.isfinite(self.pose).all() and np.isfinite(self.cov).all()):
-            lines.append("the pose estimate is not finite")
-        return lines
-
-    def save(self, directory, overwrite=False, log_source=None):
-        """Write the run's folder (`report.save`); without a `log_source` the log is copied too."""
-        from jaxslam import report
-
-        report.save(self, directory, overwrite=overwrite, log_source=log_source)
+    pose: jax.Array
+    birth: jax.Array
+    ancestors: jax.Array
 
 
 def config_for(log, sensor=None, association="maximum_likelihood", **settings):
@@ -133,41 +58,36 @@ def config_for(log, sensor=None, association="maximum_likelihood", **settings):
     return Config(sensor=sensor, association=association, **settings)
 
 
-def run(log, config=None, params=None, seed=0, progress=None):
-    """Filter a whole log.
+def run(log, config=None, params=None, seed=0, progress=None, refine=True):
+    """Filter a whole log, and refine what it found.
 
     `config`: None for `config_for(log)`; `params`: None for `default_params`; `progress`: called
-    with (frames done, frames in all) now and then, first with (0, T) before compiling. Raises
-    `ValueError` when the log can't supply what the configuration asks.
+    with (frames done, frames in all) now and then, first with (0, T) before compiling. `refine`:
+    improve the best particle's path and map by least squares (`refined`). Raises `ValueError` when
+    the log can't supply what the configuration asks.
     """
     config = config_for(log) if config is None else config
     params = default_params(config.sensor, log) if params is None else params
     params = validate(params, "params")
-    known = config.association == "known"
-    data = frames(log, config.sensor, config.measurements, params, known)
-    total = len(data.time)
+    data = _frames(log, config, params)
     if progress:
-        progress(0, total)
+        progress(0, len(data.time))
     # A local origin keeps coordinates small: float32 has 7 digits.
     origin = np.array([*log.start_pose[:2], 0.0])
     key = jax.random.key(seed)
     state = fastslam.init(config, key, log.start_pose - origin, log.start_cov)
     numbers = jax.tree.map(jnp.asarray, params)
-    chunks = _chunks(data, config)
     begin = time.perf_counter()
-    steps = _scan.lower(key, state, *next(iter(chunks)), numbers, config).compile()
+    first = next(iter(_chunks(data, config)))
+    steps = _scan.lower(key, state, *first, numbers, config).compile()
     compile_seconds = time.perf_counter() - begin
-    kept = []
-    for i, chunk in enumerate(_chunks(data, config)):
-        state, summary = steps(key, state, *chunk, numbers)
-        kept.append(jax.tree.map(np.asarray, summary))
-        if progress:
-            progress(min((i + 1) * CHUNK, total), total)
-    summary = Summary(*(np.concatenate(parts)[:total] for parts in zip(*kept, strict=True)))
-    world = _map(state, int(summary.survivor[-1]), numbers, config, data.identities, origin)
+    state, summary, tree = _filtered(steps, key, state, data, numbers, config, progress)
+    best = int(summary.survivor[-1])
+    world = _map(state, best, numbers, config, data.identities, origin)
+    looking_back = _looking_back(tree, state.log_weight, best, origin)
     seconds = time.perf_counter() - begin - compile_seconds
     n = config.particles
-    return Result(
+    result = Result(
         log=log,
         config=config,
         params=params,
@@ -184,15 +104,76 @@ def run(log, config=None, params=None, seed=0, progress=None):
         seconds=seconds,
         compile_seconds=compile_seconds,
         dropped=data.dropped,
+        **looking_back,
         **{name: getattr(summary, name) for name in (
             "cov", "ess", "resampled", "new", "log_evidence", "nonfinite", "degenerate")},
     )  # fmt: skip
+    return refined(result) if refine else result
+
+
+def refined(result, progress=None):
+    """The result with its best particle's lineage refined (`refine.refine`); as it is if it has no
+    finite lineage. `progress`: called with (iterations done, None)."""
+    from jaxslam.refine import refine  # here: the filter alone does without it
+
+    past, log, config = result.lineage, result.log, result.config
+    if past is None or not np.isfinite(past.pose).all():
+        return result
+    begin = time.perf_counter()
+    data = _frames(log, config, result.params)
+    found = refine(
+        data, past.pose, past.birth, log.start_pose, log.start_cov, result.params, config.sensor,
+        known=config.association == "known",
+        progress=progress and (lambda done, _: progress(done, None)),
+    )  # fmt: skip
+    found = found._replace(identity=_identity(found.identity, data.identities))
+    return dataclasses.replace(result, refined=found, refine_seconds=time.perf_counter() - begin)
+
+
+def _identity(dense, identities):
+    """The log's identities of dense ones; -1 stays."""
+    return np.append(identities, -1)[np.asarray(dense, np.int64)]
+
+
+def _frames(log, config, params):
+    known = config.association == "known"
+    return frames(log, config.sensor, config.measurements, params, known)
+
+
+def _filtered(steps, key, state, data, params, config, progress):
+    """The compiled `steps` over all chunks: last state, `Summary`, genealogy (None: too large)."""
+    total, kept, tree = len(data.time), [], Tree()
+    row = 4 * (config.measurements + 4)  # bytes of a node
+    done = 0
+    for chunk in _chunks(data, config):
+        state, (summary, past) = steps(key, state, *chunk, params)
+        kept.append(jax.tree.map(np.asarray, summary))
+        length = min(len(past.ancestors), total - done)  # without what fills up the last one
+        if tree is not None:
+            tree.extend(*(np.asarray(part)[:length] for part in past))
+            tree = tree if tree.nodes * row <= TREE_BYTES else None
+        done += length
+        if progress:
+            progress(done, total)
+    summary = Summary(*(np.concatenate(parts)[:total] for parts in zip(*kept, strict=True)))
+    return state, summary, tree
+
+
+def _looking_back(tree, log_weight, best, origin):
+    """`Result.ancestral` and `Result.lineage`, in the world's frame."""
+    if tree is None:
+        return {}
+    whole, past = ancestral(tree, np.asarray(log_weight)), lineage(tree, best)
+    return dict(
+        ancestral=whole._replace(pose=whole.pose + origin),
+        lineage=Lineage(past.pose + origin, past.birth),
+    )
 
 
 def _summarise(info):
     # After resampling all weights are equal: the best particle lives on in its first child.
     survivor = jnp.argmax(info.ancestors == info.estimate.best)
-    return Summary(
+    summary = Summary(
         pose=info.estimate.mean,
         cov=info.estimate.cov,
         match=info.birth[:, info.estimate.best],
@@ -200,6 +181,7 @@ def _summarise(info):
         **{name: getattr(info, name) for name in Summary._fields if hasattr(info, name)
            and name not in ("pose", "match")},
     )  # fmt: skip
+    return summary, Past(info.pose, info.birth, info.ancestors)
 
 
 def _steps(key, state, odometry, measurements, params, config):
@@ -211,15 +193,17 @@ _scan = jax.jit(_steps, static_argnames="config", donate_argnames="state")
 
 
 def _chunks(data, config):
-    """The frames in chunks of `CHUNK`, the last one filled up with frames of nothing."""
+    """The frames in chunks of one length, the last one filled up with frames of nothing."""
     real = jnp.zeros(()).dtype
     total = len(data.time)
-    for start in range(0, total, CHUNK):
+    frame = 4 * (config.measurements + 4) * config.particles  # bytes of a frame's `Past`
+    size = max(1, min(CHUNK, CHUNK_BYTES // frame))
+    for start in range(0, total, size):
         part = jax.tree.map(
-            lambda leaf, start=start: leaf[start : start + CHUNK],
+            lambda leaf, start=start: leaf[start : start + size],
             (data.odometry, data.measurements),
         )
-        missing = CHUNK - len(part[0].dx)
+        missing = size - len(part[0].dx)
 
         def fill(leaf, missing=missing):
             leaf = np.pad(leaf, [(0, missing), *[(0, 0)] * (leaf.ndim - 1)])
@@ -233,8 +217,8 @@ def _map(state, best, params, config, identities, origin):
     table = maps.summarise(state.landmarks, jnp.exp(state.log_weight), best, params, config)
     table = jax.tree.map(np.asarray, table)
     kept = np.flatnonzero(table.kept)
-    slots = len(identities)
-    identity = np.array([identities[i] if i < slots else -1 for i in kept], dtype=np.int64)
+    # Known identities are slots; without them no slot has one.
+    identity = _identity(np.where(kept < len(identities), kept, -1), identities)
     return MapEstimate(
         id=table.birth[kept].astype(np.int64),
         mean=table.mean[:, kept].T + origin[:2],

@@ -5,11 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jaxslam import runner
 from jaxslam.config import Config, default_params
-from jaxslam.runner import config_for, run
+from jaxslam.evaluate import ate
+from jaxslam.runner import config_for, refined
 from jaxslam.simulate import planar
 
 SIZES = dict(particles=30, landmarks=30)
+
+
+def run(*given, **named):
+    """Without refinement, which most of these tests are not about."""
+    return runner.run(*given, refine=False, **named)
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +126,58 @@ def same(a, b):
         np.testing.assert_array_equal(one, two)
 
 
+def test_the_past_is_that_of_the_living(log, config, result):
+    found, past = result.ancestral, result.lineage
+    t, k = len(log.frame_time), config.measurements
+    assert (found.pose.shape, found.cov.shape, found.distinct.shape) == ((t, 3), (t, 3, 3), (t,))
+    assert (past.pose.shape, past.birth.shape) == ((t, 3), (t, k))
+    assert (np.diff(found.distinct) >= 0).all() and found.distinct[-1] <= config.particles
+    assert found.distinct[0] == 1 < found.distinct[-1]
+    true = log.truth.pose
+    assert ate(found.pose, true, align=False)[0] < 1.1 * ate(result.pose, true, align=False)[0]
+    np.testing.assert_allclose(found.pose[0], past.pose[0], atol=1e-6)
+    # Most of what one particle took measurements for is what the best one did, frame by frame.
+    assert np.mean(past.birth == result.match) > 0.9
+    np.testing.assert_array_equal(past.birth == -3, result.row == -1)
+    (line,) = result.advice
+    assert "% of the path, all particles descend from one" in line
+    assert result.refined is result.landmarks_refined is None
+
+
+def test_a_chunks_length_changes_nothing(log, config, result, monkeypatch):
+    # Seven frames hand over this much; one fewer fits.
+    monkeypatch.setattr(runner, "CHUNK_BYTES", 28 * (config.measurements + 4) * 30 - 1)
+    other = run(log, config, seed=3)
+    same(other, result)
+    for one, two in zip(
+        (*other.ancestral, *other.lineage), (*result.ancestral, *result.lineage), strict=True
+    ):
+        np.testing.assert_array_equal(one, two)
+
+
+def test_a_genealogy_that_takes_too_much_memory_is_given_up(log, config, monkeypatch):
+    monkeypatch.setattr(runner, "TREE_BYTES", 1000)
+    found = runner.run(log, config, seed=3)
+    assert found.ancestral is found.lineage is found.refined is found.refine_seconds is None
+    assert found.flags == []
+    assert "too much memory" in found.advice[0]
+
+
+def test_refining_is_told_and_comes_near_the_truth(log, result):
+    calls = []
+    found = refined(result, lambda *args: calls.append(args))
+    assert len(calls) > 1 and {total for _, total in calls} == {None}
+    assert found.refine_seconds > 0
+    true = log.truth.pose
+    better = ate(found.refined.pose, true, align=False)[0]
+    assert better < 0.9 * ate(result.pose, true, align=False)[0]
+    world = found.landmarks_refined
+    assert world._fields == result.landmarks._fields
+    assert world.mean.shape == (len(world.id), 2) and world.cov.shape == (len(world.id), 3)
+    nearest = np.hypot(*(world.mean[:, None] - log.truth.landmarks).T).min(0)
+    assert np.median(nearest) < 0.1
+
+
 def test_one_seed_gives_the_same_bits_with_truth_or_without(log, config, result):
     same(result, run(replace(log, truth=None), config, seed=3))
 
@@ -172,13 +231,13 @@ def test_flags_of_what_went_wrong(log, result):
 def test_known_identities_name_the_landmarks(log):
     config = config_for(log, association="known", particles=30)
     assert config.landmarks == len(np.unique(log.identity[log.identity >= 0]))
-    result = run(log, config)
+    result = runner.run(log, config)  # and refines
     clutter = int((log.identity < 0).sum())
     assert result.dropped["no identity"] == clutter > 0
-    identity = result.landmarks.identity
-    assert len(np.unique(identity)) == len(identity) > 10
-    true = log.truth.landmarks[np.searchsorted(log.truth.landmark_id, identity)]
-    assert np.hypot(*(result.landmarks.mean - true).T).max() < 0.5
+    for world, most in ((result.landmarks, 0.5), (result.landmarks_refined, 0.3)):
+        assert len(np.unique(world.identity)) == len(world.identity) > 10
+        true = log.truth.landmarks[np.searchsorted(log.truth.landmark_id, world.identity)]
+        assert np.hypot(*(world.mean - true).T).max() < most
 
 
 def test_a_sensor_or_identities_that_the_log_lacks_are_named(log):
