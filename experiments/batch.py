@@ -1,7 +1,8 @@
 """The batch bearing-only solution with known identities by GTSAM: what a smoother could reach.
 
-    python experiments/batch.py                    the table of all logs, and the noise's part in it
-    python experiments/batch.py --gains            writes experiments/params/mrclam_d6_r*.toml
+    python experiments/batch.py                 every log's own solution
+    python experiments/batch.py --sensitivity   and what every noise parameter does to it
+    python experiments/batch.py --gains         writes experiments/params/mrclam_d6_r*.toml
 
 All measurements at once, started at the true path; same model as the filter's: `motion.model` with
 its gains and the full covariance of every interval, `sensors`' bearing noise (range dependent, at
@@ -11,35 +12,43 @@ maximisation: each measurement weighs its posterior probability of not being clu
 (`pip install gtsam`). MRCLAM may not be redistributed: ../shared/data/mrclam, or left out.
 """
 
+import argparse
+import json
 import time
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
+from scipy.optimize import minimize_scalar
 
-from jaxslam import sensors
-from jaxslam.evaluate import align_se2, ate, map_error, truth_at, with_truth, wrap
+from jaxslam import default_params, load_log, load_params, sensors
+from jaxslam.evaluate import align_se2, ate, between, map_error, truth_at, with_truth, wrap
 from jaxslam.frames import frames
 from jaxslam.motion import model
+from jaxslam.readers import read_mrclam
 
 HERE = Path(__file__).parent
+NOISES = ("sigma_bearing", "growth", "err_tran", "err_rot", "err_drift", "floor_tran")
+NOISES += ("floor_rot", "outlier", "correlation", "mount_yaw", "gain_rot", "gain_tran")
 RESULTS, PARAMS = HERE / "results", HERE / "params"
 MRCLAM = HERE.parents[1] / "shared" / "data" / "mrclam" / "MRCLAM_Dataset6"
 MISSING = "GTSAM is not installed (pip install gtsam): no batch solution"
-SETTLED = 1e-4  # m: rounds end when no pose moves farther
+SETTLED = 1e-3  # m: rounds end when no pose moves farther
 TINY = 1e-6  # m, rad: noise of what the model takes for exact; GTSAM needs some
 
 
 class Batch(NamedTuple):
     """Path `pose` [T, 3] of the robot and `landmarks` [L, 2] in the world, their `identity` [L],
-    `weight` [n]: that a measurement is no clutter; `residual` [n] of the bearings, rad."""
+    `weight` [n]: that a measurement is no clutter; `residual` [n] of the bearings, rad; `cost`: of
+    path and map, - log of the posterior density but for a constant."""
 
     pose: np.ndarray
     landmarks: np.ndarray
     identity: np.ndarray
     weight: np.ndarray
     residual: np.ndarray
+    cost: float
     rounds: int
     settled: bool
     seconds: float
@@ -71,11 +80,9 @@ def solve(log, params, start=None, rounds=30):
     first = compose(np.array(log.start_pose)[None], mounting(params))[0]
     fixed = prior(log, params), first
     noise = bearing_noise(data.odometry, params)
-    for done in range(rounds):
-        offset = points[who] - sensor[frame, :2]
-        residual = wrap(np.arctan2(offset[:, 1], offset[:, 0]) - sensor[frame, 2] - bearing)
-        variance = noise[0][frame] + noise[1][frame] / (offset**2).sum(1)
-        weight = inlier(residual, variance, noise, frame, params)
+    for done in range(1, rounds + 1):  # noqa: B007
+        residual, variance = bearing_residuals(sensor, points, (frame, who, bearing), noise)
+        weight = inlier(residual, variance, noise, frame, params)[0]
         before = sensor
         sensor, points = optimise(
             fixed, (move, cov), (frame, who, bearing, variance / weight), (sensor, points)
@@ -83,9 +90,12 @@ def solve(log, params, start=None, rounds=30):
         settled = np.abs((sensor - before)[:, :2]).max() < SETTLED
         if settled:
             break
-    inverse = compose_inverse(mounting(params))
+    residual, variance = bearing_residuals(sensor, points, (frame, who, bearing), noise)
+    weight, density = inlier(residual, variance, noise, frame, params)
+    cost = motion_cost(np.vstack([fixed[1], sensor]), move, cov) - np.log(density).sum()
     seconds = time.perf_counter() - begin
-    return Batch(compose(sensor, inverse), points, data.identities, weight, residual, done + 1,
+    pose = compose(sensor, compose_inverse(mounting(params)))
+    return Batch(pose, points, data.identities, weight, residual, float(cost), done,
                  bool(settled), seconds)  # fmt: skip
 
 
@@ -185,14 +195,35 @@ def bearing_noise(odometry, params):
     )
 
 
+def bearing_residuals(sensor, points, seen, noise):
+    """Residuals [n] of the bearings and their variances, which depend on range."""
+    frame, who, bearing = seen
+    offset = points[who] - sensor[frame, :2]
+    residual = wrap(np.arctan2(offset[:, 1], offset[:, 0]) - sensor[frame, 2] - bearing)
+    return residual, noise[0][frame] + noise[1][frame] / np.maximum((offset**2).sum(1), 1e-6)
+
+
 def inlier(residual, variance, noise, frame, params):
-    """Posterior probability [n] that a bearing is no clutter, which is uniform over the view."""
-    share = (noise[0] / params.sigma_bearing**2)[frame]  # what `correlated` multiplied by
-    variance = variance / share
-    normal = np.exp(-0.5 * residual**2 / variance) / np.sqrt(2 * np.pi * variance)
-    clutter = params.outlier / (params.view_max - params.view_min)
+    """Posterior probability [n] that a bearing is no clutter, which is uniform over the view, and
+    density [n] under both; what `correlated` does to the variance is left out of the decision."""
+    share = (noise[0] / params.sigma_bearing**2)[frame]
+    alone = variance / share
+    normal = np.exp(-0.5 * residual**2 / alone) / np.sqrt(2 * np.pi * alone)
     normal = (1 - params.outlier) * normal
-    return np.maximum(normal / (normal + clutter + 1e-300), 1e-9)
+    clutter = params.outlier / (params.view_max - params.view_min) + 1e-300
+    # a measurement that counts for `1 / share` of one adds as much of its log density
+    return np.maximum(normal / (normal + clutter), 1e-9), (normal + clutter) ** (1 / share)
+
+
+def motion_cost(sensor, move, cov):
+    """- log density of the path [1 + T, 3] under the intervals' motion, but for a constant."""
+    step = between(sensor[:-1], sensor[1:]) - move
+    c, s = np.cos(move[:, 2]), np.sin(move[:, 2])
+    error = np.column_stack(
+        [c * step[:, 0] + s * step[:, 1], c * step[:, 1] - s * step[:, 0], wrap(step[:, 2])]
+    )
+    squares = error * np.linalg.solve(cov, error[:, :, None])[:, :, 0]
+    return (squares.sum() + np.linalg.slogdet(cov)[1].sum()) / 2
 
 
 def true_start(log, data):
@@ -242,3 +273,100 @@ def errors(batch, log):
     there = np.array([places[int(who)] for who in batch.identity[rows]])
     here = batch.landmarks[rows]
     return found | {"scale": float(np.sqrt(here.var(0).sum() / there.var(0).sum()))}
+
+
+def mrclam(robot):
+    """`Log` of a robot of MRCLAM's dataset 6 and the file of its gains; None where it is absent."""
+    if not MRCLAM.is_dir():
+        return None, None
+    return read_mrclam(MRCLAM, robot), PARAMS / f"mrclam_d6_r{robot}.toml"
+
+
+def gained(log, file=None):
+    """Default parameters of bearings, with a robot's own gains where there is a file of them."""
+    params = default_params("bearing", log)
+    return load_params(file, params) if file is not None and file.exists() else params
+
+
+def find_gain(log):
+    """`gain_rot` of a log without its truth: where path, map and gain together are most probable.
+
+    The search starts each solution at the one before; the first starts at the true path.
+    `gain_tran` can't be found from bearings: it scales map and path alike.
+    """
+    params, last = default_params("bearing", log), [None]
+
+    def cost(gain):
+        found = solve(log, params._replace(gain_rot=gain), last[0], rounds=6)
+        last[0] = found.pose
+        return found.cost
+
+    best = minimize_scalar(cost, bounds=(0.75, 1.1), method="bounded", options={"xatol": 2e-3})
+    return float(best.x)
+
+
+def write_gains():
+    """A parameter file with the gain of each robot of MRCLAM's dataset 6."""
+    PARAMS.mkdir(exist_ok=True)
+    for robot in range(1, 6):
+        log, file = mrclam(robot)
+        gain = round(find_gain(log), 3)
+        file.write_text(
+            f"# MRCLAM dataset 6, robot {robot}: from its log without truth, batch.py --gains\n"
+            f"gain_rot = {gain}  # true / measured\n"
+        )
+        print(file.name, gain, flush=True)
+
+
+def variants(params):
+    """Name and `Params`: as they are, and each noise at a third and three times its value."""
+    yield "as they are", params
+    for name in NOISES:
+        value = getattr(params, name)
+        for factor in (1 / 3, 3):
+            if name == "mount_yaw":
+                changed, title = value + np.radians(factor), f"+ {factor:.2g} deg"
+            elif name.startswith("gain"):
+                changed, title = value * (0.95 if factor < 1 else 1.05), "* 0.95 or 1.05"
+            else:
+                changed, title = value * factor, f"* {factor:.2g}"
+            if changed != value:
+                yield f"{name} {title}", params._replace(**{name: changed})
+
+
+def main():
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument("--sensitivity", action="store_true")
+    options.add_argument("--gains", action="store_true")
+    options = options.parse_args()
+    if not installed():
+        raise SystemExit(MISSING)
+    if options.gains:
+        return write_gains()
+    lines = ["| log | parameters | path [m] | landmarks [m] | scale | rounds | seconds |"]
+    lines += ["|---|---|--:|--:|--:|--:|--:|"]
+    print(*lines, sep="\n")
+    content = []
+    logs = [(load_log("lost-in-the-woods"), None), *(mrclam(robot) for robot in range(1, 6))]
+    for log, file in logs:
+        if log is None:
+            continue
+        for name, params in variants(gained(log, file)):
+            found = solve(log, params)
+            error = errors(found, log)
+            content.append({"log": log.name, "parameters": name, **error})
+            lines.append(
+                f"| {log.name} | {name} | {error['ate_m']:.3f} | {error['landmark_m']:.3f} "
+                f"| {error['scale']:.3f} | {found.rounds} | {found.seconds:.0f} |"
+            )
+            print(lines[-1], flush=True)
+            if not options.sensitivity:
+                break
+    RESULTS.mkdir(exist_ok=True)
+    name = "batch_sensitivity" if options.sensitivity else "batch"
+    (RESULTS / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
+    (RESULTS / f"{name}.md").write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()
