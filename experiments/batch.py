@@ -282,9 +282,9 @@ def mrclam(robot):
     return read_mrclam(MRCLAM, robot), PARAMS / f"mrclam_d6_r{robot}.toml"
 
 
-def gained(log, file=None):
-    """Default parameters of bearings, with a robot's own gains where there is a file of them."""
-    params = default_params("bearing", log)
+def gained(log, file=None, sensor="bearing"):
+    """Default parameters of a sensor, with a robot's own gains where there is a file of them."""
+    params = default_params(sensor, log)
     return load_params(file, params) if file is not None and file.exists() else params
 
 
