@@ -9,21 +9,17 @@ path (`sensors.correlated`) raise the whole density of a measurement to a power 
 NumPy in float64, derivatives by JAX in double precision.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.special import expit
 
-from jaxslam import chain, motion, sensors
+from jaxslam import chain, residuals, sensors
 from jaxslam.config import Params
-from jaxslam.geometry import wrap
 from jaxslam.odometry import Odometry
 
-LEAST_VARIANCE = 1e-12  # m^2, rad^2, of noise that is declared to be none
 LEAST_INFORMATION = 1e-6  # 1/m^2 of a point that no measurement holds
 ITERATIONS = 60
 CLOSE = 1e-10  # squared length of a step that changes nothing, in posterior standard deviations
@@ -80,7 +76,7 @@ def problem(frames, start_pose, start_cov, params, sensor):
         value = value * gain[:, None]
     cov = np.zeros((3, 3)) if start_cov is None else np.asarray(start_cov, float)
     variance, axes = np.linalg.eigh(cov)
-    root = (axes / np.sqrt(np.maximum(variance, LEAST_VARIANCE))).T
+    root = (axes / np.sqrt(np.maximum(variance, residuals.LEAST_VARIANCE))).T
     return Problem(
         sensor=sensor,
         odometry=odometry,
@@ -127,8 +123,8 @@ def log_inlier(given, path, point):
     """log density [M] of all measurements, were they of `point` [2]: that of an inlier."""
     pose = path[given.frame + 1]
     point = np.broadcast_to(point, (len(pose), 2))
-    scale = _scales(given.sensor, pose, point, given.cov, given.params)
-    rest = _residuals(given.sensor, pose, point, given.value, scale, given.params)
+    scale = np.asarray(residuals.scales(given.sensor, pose, point, given.cov, given.params))
+    rest = residuals.innovations(given.sensor, pose, point, given.value, scale, given.params)
     return _log_density(given, np.asarray(rest), scale)
 
 
@@ -194,9 +190,9 @@ class _Linear(NamedTuple):
 
 def _linearise(given, path, points, which):
     pose, point = path[given.frame + 1], _gather(points, which)
-    scales = _scales(given.sensor, pose, point, given.cov, given.params)
-    moved = _motion_jacobian(path[:-1], path[1:], given.odometry, given.params)
-    seen = _jacobian(given.sensor, pose, point, given.value, scales, given.params)
+    scales = np.asarray(residuals.scales(given.sensor, pose, point, given.cov, given.params))
+    moved = residuals.motion_jacobian(path[:-1], path[1:], given.odometry, given.params)
+    seen = residuals.jacobian(given.sensor, pose, point, given.value, scales, given.params)
     return _Linear(
         start=(_start(given, path), given.root),
         moved=jax.tree.map(np.asarray, moved),
@@ -246,9 +242,11 @@ def _weigh(given, linear, which, width):
 def _cost(given, path, points, which, linear, width):
     """The cost elsewhere, with the variances of `linear`."""
     pose, point = path[given.frame + 1], _gather(points, which)
-    rest = _residuals(given.sensor, pose, point, given.value, linear.scales, given.params)
+    rest = residuals.innovations(
+        given.sensor, pose, point, given.value, linear.scales, given.params
+    )
     _, cost = _mixture(given, np.asarray(rest), linear.scales, which, width)
-    moved = np.asarray(_motions(path[:-1], path[1:], given.odometry, given.params))
+    moved = np.asarray(residuals.motions(path[:-1], path[1:], given.odometry, given.params))
     return float(cost + (np.sum(_start(given, path) ** 2) + np.sum(moved**2)) / 2)
 
 
@@ -299,78 +297,3 @@ def sums(index, parts, size):
     place = index[:, None] * inner + np.arange(inner)
     total = np.bincount(place.ravel(), parts.ravel(), size * inner)
     return total.reshape(size, *parts.shape[1:])
-
-
-def _motion(before, after, odometry, params):
-    """Whitened error [3] of one interval: along the chord, heading, and the rest sideways."""
-    m = motion.model(odometry, params)
-    c, s = jnp.cos(before[2] + m.chord), jnp.sin(before[2] + m.chord)
-    dx, dy = after[0] - before[0], after[1] - before[1]
-    heading = wrap(after[2] - before[2] - m.turn)
-    error = jnp.stack([c * dx + s * dy - m.length, heading, c * dy - s * dx - m.slope * heading])
-    variance = jnp.stack([m.var_along, m.var_heading, m.var_rest])
-    return error / jnp.sqrt(jnp.maximum(variance, LEAST_VARIANCE))
-
-
-def _scale(sensor, pose, point, cov, params):
-    """What whitens a measurement: factors of the first and second component, and how much of the
-    first is taken out of the second (`position`: by Cholesky's factor)."""
-    if sensor == "position":
-        xx, xy, yy = (params.position_scale**2 * part for part in cov)
-        share = xy / xx
-        return 1 / jnp.sqrt(xx), 1 / jnp.sqrt(yy - share * xy), share
-    place = sensors.pose_of(tuple(pose), params)
-    seen = sensors.observe("range_bearing", place, tuple(point), None, params)
-    along, angle = (1 / jnp.sqrt(variance) for variance in seen.noise)
-    zero = jnp.zeros_like(along)
-    return (angle, zero, zero) if sensor == "bearing" else (along, angle, zero)
-
-
-def _residual(sensor, pose, point, value, scale, params):
-    """Whitened innovation of one measurement: [1] of a bearing, else [2]."""
-    place = sensors.pose_of(tuple(pose), params)
-    # A point has no depth to be uncertain of: its bearing is that of a range and bearing.
-    kind = "position" if sensor == "position" else "range_bearing"
-    seen = sensors.observe(kind, place, tuple(point), None, params).value
-    if sensor == "bearing":
-        return jnp.stack([wrap(value[0] - seen[1]) * scale[0]])
-    first, second = value[0] - seen[0], value[1] - seen[1]
-    second = second if sensor == "position" else wrap(second)
-    return jnp.stack([first * scale[0], (second - scale[2] * first) * scale[1]])
-
-
-@jax.jit
-def _motions(before, after, odometry, params):
-    return jax.vmap(_motion, (0, 0, 0, None))(before, after, odometry, params)
-
-
-@jax.jit
-def _motion_jacobian(before, after, odometry, params):
-    derivative = jax.vmap(jax.jacfwd(_motion, (0, 1)), (0, 0, 0, None))
-    rest = _motions(before, after, odometry, params)
-    return rest, *derivative(before, after, odometry, params)
-
-
-@partial(jax.jit, static_argnames="sensor")
-def _all_scales(sensor, pose, point, cov, params):
-    one = partial(_scale, sensor)
-    return jnp.stack(jax.vmap(one, (0, 0, 0, None))(pose, point, cov, params))
-
-
-def _scales(sensor, pose, point, cov, params):
-    """`_scale` of all measurements, [3, M]."""
-    return np.asarray(_all_scales(sensor, pose, point, cov, params))
-
-
-@partial(jax.jit, static_argnames="sensor")
-def _residuals(sensor, pose, point, value, scales, params):
-    one = partial(_residual, sensor)
-    return jax.vmap(one, (0, 0, 0, 1, None))(pose, point, value, scales, params)
-
-
-@partial(jax.jit, static_argnames="sensor")
-def _jacobian(sensor, pose, point, value, scales, params):
-    one = partial(_residual, sensor)
-    derivative = jax.vmap(jax.jacfwd(one, (0, 1)), (0, 0, 0, 1, None))
-    rest = _residuals(sensor, pose, point, value, scales, params)
-    return rest, *derivative(pose, point, value, scales, params)

@@ -117,7 +117,8 @@ def _refined(frames, given, fit, groups, place, counts, known):
     identity = np.full(len(groups.label), -1)
     if known:
         identity = np.asarray(frames.measurements.identity).ravel()[groups.label]
-    label = np.where((groups.of >= 0) & ((which < 0) | sure), groups.label[groups.of], -2)
+    used = (groups.of >= 0) & ((which < 0) | sure)
+    label = np.where(used, np.append(groups.label, -2)[groups.of], -2)
     match = np.full(frames.measurements.valid.size, -3)
     match[place] = np.where(label == place, -1, label)
     pose = fit.path[1:].copy()
