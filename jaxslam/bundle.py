@@ -22,7 +22,10 @@ from jaxslam.odometry import Odometry
 
 LEAST_INFORMATION = 1e-6  # 1/m^2 of a point that no measurement holds
 ITERATIONS = 60
-CLOSE = 1e-10  # squared length of a step that changes nothing, in posterior standard deviations
+# Squared length of a step that changes nothing, in posterior standard deviations: at the end, and
+# under a wide kernel, which only leads there.
+CLOSE, CLOSE_WIDE = 1e-8, 1e-2
+MOST_DAMPING = 1e8
 
 
 class Problem(NamedTuple):
@@ -142,40 +145,40 @@ def _descend(given, path, points, which, width, progress):
     Damping scales the information of the motion and of the points, not its diagonal: a bent path
     can then still straighten as a whole. A step is taken only if the cost falls.
     """
-    damping = 0.0
+    damping, close = 0.0, CLOSE if width == 1 else CLOSE_WIDE
     for count in range(1, ITERATIONS + 1):
         linear = _linearise(given, path, points, which)
         inlier, cost = _weigh(given, linear, which, width)
         weight = inlier * given.share
         while True:
             normal = _assemble(given, linear, weight, which, len(points), damping)
-            moved, shifted, gained = _step(given, normal, path, points)
-            if gained is None:
-                return path, points, count, False
+            moved, shifted, gained = _step(normal, path, points)
             after = _cost(given, moved, shifted, which, linear, width)
-            if after <= cost or gained < CLOSE:
+            # No more than this is the squared length of the undamped step.
+            at_rest = (1 + damping) * gained < close
+            if after <= cost or at_rest:
                 break
             damping = max(10 * damping, 1e-3)
-            if damping > 1e8:
+            if damping > MOST_DAMPING:
                 return path, points, count, False
         if after <= cost:
             path, points = moved, shifted
         if progress:
-            progress(count, after)
-        if gained < CLOSE:
+            progress(count, min(after, cost))
+        if at_rest:
             return path, points, count, True
         damping = damping / 10 if damping > 1e-3 else 0.0
     return path, points, count, False
 
 
-def _step(given, normal, path, points):
-    """The path and the points after a step, and its squared length (None: there is none)."""
+def _step(normal, path, points):
+    """The path and the points after a step, and its squared length; NaN where there is none."""
     try:
         turn, shift, _ = chain.solve(normal)
     except np.linalg.LinAlgError:
-        return path, points, None
+        return path * np.nan, points, np.nan
     gained = np.sum(normal.pose_gradient * turn) + np.sum(normal.point_gradient * shift)
-    return path + turn, points + shift, gained if np.isfinite(gained) else None
+    return path + turn, points + shift, gained
 
 
 class _Linear(NamedTuple):
