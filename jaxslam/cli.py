@@ -13,7 +13,19 @@ from typing import Literal
 from cyclopts import App, CycloptsError, Parameter
 
 from jaxslam import cli_images
-from jaxslam.console import DEMO, LogName, Overwrite, Seed, bar, check_new, option, warn, whole
+from jaxslam.config import ASSOCIATIONS, PROPOSALS
+from jaxslam.console import (
+    DEMO,
+    LogName,
+    Overwrite,
+    Seed,
+    bar,
+    check_new,
+    note,
+    option,
+    warn,
+    whole,
+)
 
 HELP = f"""FastSLAM: from a logged run to map, trajectory and figures.
 
@@ -45,8 +57,11 @@ Paper = option(bool, "the paper's rules: positions, each its best match, no clut
 Sensors = Literal["range_bearing", "position", "bearing"]
 Sensor = option(Sensors, "what is used (the first that the log has)") | None
 Worlds = Literal["room", "grid", "field"]
-Associations = Literal["maximum_likelihood", "known"]
-Association = option(Associations, "find out which landmark was measured, or believe the log")
+ASSOCIATED = "find out which landmark was measured, believe the log, or draw by particle"
+Association = option(Literal[ASSOCIATIONS], ASSOCIATED)
+Plain = Literal["maximum_likelihood", "known"]
+PROPOSED = "poses drawn from odometry, or informed by the measurements"
+Proposal = option(Literal[PROPOSALS], PROPOSED) | None
 
 
 @app.command
@@ -67,18 +82,22 @@ def run(
     *,
     sensor: Sensor = None,
     association: Association = "maximum_likelihood",
+    proposal: Proposal = None,
     particles: whole("how many hypotheses of the path") = 1000,
     landmarks: whole("slots of the map (64; known: one each)") | None = None,
     params: ParamFile = None,
     paper: Paper = False,
+    no_refine: option(bool, "only filter: path and map are not refined afterwards") = False,
     seed: Seed = 0,
     out: option(Path, "folder to write (runs/LOG-SENSOR-SEED)") | None = None,
     overwrite: Overwrite = False,
 ):
-    """Filter a log: trajectory, map, figures and errors in a folder.
+    """Filter a log, then refine: trajectory, map, figures and errors in a folder.
 
-    The folder holds map.png, error.png, particles.png, trajectory.tum,
-    landmarks.csv, summary.json, run.toml (every setting), events.jsonl, steps.npz.
+    trajectory.tum and landmarks.csv are the filter's, as it knew them at the time.
+    trajectory_refined.tum and landmarks_refined.csv are the best particle's past
+    and map improved by least squares. The folder also holds map.png, error.png,
+    particles.png, summary.json, run.toml (every setting), events.jsonl, steps.npz.
 
     Example: jaxslam run lost-in-the-woods --particles 2000 --out runs/woods
     """
@@ -87,19 +106,34 @@ def run(
         from jaxslam.log import load_log
 
         loaded = load_log(log)
-    model = _model(loaded, sensor, association, particles, landmarks, params, paper)
+    model = _model(loaded, sensor, association, particles, landmarks, params, paper, proposal)
     out = out or Path("runs") / f"{Path(log).stem}-{model[0].sensor}-{seed}"
     report.check_target(out, overwrite)
     with bar("filtering", compiles=True) as progress:
-        result = runner.run(loaded, *model, seed, progress)
+        result = runner.run(loaded, *model, seed, progress, refine=False)
+    if not no_refine:
+        with bar("refining") as progress:
+            result = runner.refined(result, progress)
     with bar("writing"):
         report.save(result, out, overwrite, log_source=log)
-    print(report.error_table(report.summarise(result)))
+    _told(result, out)
+    return int(bool(result.flags))
+
+
+def _told(result, out):
+    """Print what a run found, its advice and its warnings."""
+    from jaxslam import report
+    from jaxslam.error_table import error_table
+
+    print(error_table(report.summarise(result)))
     spent = f"{result.seconds:.1f} s, and {result.compile_seconds:.1f} s to compile"
+    if result.refined is not None:
+        spent += f"; refined in {result.refine_seconds:.1f} s"
     print(f"{len(result.time)} steps in {spent}\n{out}: the map is {out / 'map.png'}")
+    for line in result.advice:
+        note(line)
     for line in result.flags:
         warn(line)
-    return int(bool(result.flags))
 
 
 @app.command
@@ -108,10 +142,13 @@ def compare(
     /,
     *,
     sensor: Sensor = None,
-    association: Association = "maximum_likelihood",
+    association: option(
+        Plain, "find out which landmark was measured, or believe the log"
+    ) = "maximum_likelihood",
     params: ParamFile = None,
     paper: Paper = False,
-    particles: option(str, "particle counts, by commas") = "20,100",
+    particles: option(str, "particle counts of the baseline, by commas") = "20,100",
+    variants: whole("particles of the second table's filters (0: no table)", 0) = 1000,
     steps: whole("frames to filter") = 200,
     every: whole("use each n-th frame (the steps cover a tenth)") | None = None,
     seed: Seed = 0,
@@ -119,7 +156,8 @@ def compare(
     """Show the filter beside the plain NumPy baseline: agreement, accuracy, time.
 
     Both get the same random draws. The baseline is slow: 20 particles over 200
-    steps take it some 10 seconds.
+    steps take it some 10 seconds. A second table adds the paper's rules, FastSLAM
+    1.0, the informed proposal and refinement, with more particles.
 
     Example: jaxslam compare lost-in-the-woods --particles 20,100 --steps 200
     """
@@ -135,6 +173,13 @@ def compare(
         with bar(f"{count} particles", compiles=True) as progress:
             rows.append(sides.compare(loaded, *model, seed, steps, every, progress))
     print(sides.table(rows))
+    if variants:
+        from jaxslam import variants as rules
+
+        with bar("variants", compiles=True) as progress:
+            model = _model(loaded, sensor, association, variants, None, params, paper)
+            found = rules.variants(loaded, *model, seed, steps, every, rows, progress)
+        print(f"\n{rules.table(found)}")
     parted = [row.double for row in rows if row.double.same < row.double.steps]
     for row in parted:
         warn(f"{row.particles} particles: the two part at step {row.same}")
@@ -196,9 +241,10 @@ def evaluate(folder: Folder, /, *, json: option(bool, "as JSON") = False, log: M
 
     with bar("reading"):
         from jaxslam import report
+        from jaxslam.error_table import error_table
 
         errors = report.evaluate_folder(folder, log)
-    print(dumps(errors, indent=2) if json else report.error_table(errors))
+    print(dumps(errors, indent=2) if json else error_table(errors))
 
 
 @app.command
@@ -289,17 +335,19 @@ def main(argv=None):
     return 2
 
 
-def _model(log, sensor, association, particles, landmarks, params, paper):
+def _model(log, sensor, association, particles, landmarks, params, paper, proposal=None):
     """`Config` and `Params` as the options say."""
     from jaxslam.config import Config, default_params
     from jaxslam.paramfile import load_params
     from jaxslam.runner import config_for
 
-    sizes = {"particles": particles} | ({"landmarks": landmarks} if landmarks else {})
-    config = config_for(log, sensor or ("position" if paper else None), association, **sizes)
+    told = {"particles": particles, "landmarks": landmarks, "proposal": proposal}
+    told = {name: value for name, value in told.items() if value}
+    config = config_for(log, sensor or ("position" if paper else None), association, **told)
     if paper:
         sizes = config.particles, config.landmarks, config.measurements
-        config = Config.paper(*sizes, sensor=config.sensor, association=association)
+        rules = {"sensor": config.sensor, "association": association}
+        config = Config.paper(*sizes, **rules | ({"proposal": proposal} if proposal else {}))
     base = default_params(config.sensor, log)
     return config, load_params(params, base) if params else base
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import baseline, geometry
+from jaxslam import baseline, baseline_ekf, geometry
 from jaxslam import filter as fastslam
 from jaxslam.config import Params, default_params
 from jaxslam.evaluate import ate, truth_at, wrap
@@ -28,7 +28,8 @@ class Agreement(NamedTuple):
     particles; of `landmarks` (means and covariances) and `births`, at the end (inf where only one
     has a landmark; NaN when `same` < T). Counted in the baseline: steps that `resampled`; landmarks
     `born`, `freed` and lost in `overflow`, per particle; measurements that were `clutter`, per
-    particle. Mean poses [T, 3] and seconds of both, `compile_seconds` apart.
+    particle. Mean poses [T, 3] and seconds of both, `compile_seconds` apart, and the map of the
+    baseline's best particle.
     """
 
     steps: int
@@ -47,6 +48,14 @@ class Agreement(NamedTuple):
     seconds_baseline: float
     seconds_filter: float
     compile_seconds: float
+    map_baseline: "PointMap"
+
+
+class PointMap(NamedTuple):
+    """World points `mean` [L, 2], m, and the log's `identity` [L] (-1: hidden)."""
+
+    mean: np.ndarray
+    identity: np.ndarray
 
 
 class Comparison(NamedTuple):
@@ -63,16 +72,23 @@ def compare(log, config, params=None, seed=0, steps=200, every=None, progress=No
     """`Comparison` over `steps` of the log's frames, every `every`-th from the first on.
 
     `every`: None to cover a tenth of the log, or as much as there is. `progress`: as for
-    `agreement`, which is run in float64 and in float32.
+    `agreement`, which is run in float64 and in float32. The baseline has no other proposal than
+    the prior, so both use that.
     """
-    if every is None:
-        every = max(1, len(log.frame_time) // (10 * steps))
-    log = select(log, np.arange(0, len(log.frame_time), every)[:steps])
+    config = dataclasses.replace(config, proposal="prior")
+    log = select(log, thinned(log, steps, every))
     double = agreement(log, config, params, seed, steps, True, progress)
     single = agreement(log, config, params, seed, steps, False, progress)
     true = truth_at(log.truth, log.frame_time)
     errors = [ate(p, true, align=False)[0] for p in (single.pose_baseline, single.pose_filter)]
     return Comparison(double, single, *errors)
+
+
+def thinned(log, steps, every=None):
+    """Numbers of `steps` frames, every `every`-th from the first on (None: over a tenth)."""
+    if every is None:
+        every = max(1, len(log.frame_time) // (10 * steps))
+    return np.arange(0, len(log.frame_time), every)[:steps]
 
 
 def agreement(log, config, params=None, seed=0, steps=None, double=True, progress=None):
@@ -82,6 +98,10 @@ def agreement(log, config, params=None, seed=0, steps=None, double=True, progres
     The baseline is in float64 always, and gets the filter's draws. `progress`: called with
     (done, total), first with (0, total) before compiling.
     """
+    if config.proposal != "prior" or config.association == "sampled":
+        raise ValueError(
+            "compare: the baseline has the prior proposal, and maximum_likelihood or known"
+        )
     params = default_params(config.sensor, log) if params is None else params
     params = Params(*map(float, params))
     if steps is not None:
@@ -114,6 +134,7 @@ def agreement(log, config, params=None, seed=0, steps=None, double=True, progres
         seconds_baseline=spent,
         seconds_filter=ran,
         compile_seconds=compiled,
+        map_baseline=_baseline_map(reference, params, config, data.identities, origin),
     )
 
 
@@ -207,10 +228,26 @@ def _run_filter(data, config, params, seed, start, log):
     final, trace = jax.block_until_ready(steps(key, state, *given))
     ran = time.perf_counter() - begin
     numbers = jnp.arange(len(data.time), dtype=jnp.int32)
-    normals, uniforms = jax.vmap(lambda step: fastslam.draws(key, step, config))(numbers)
-    draws = fastslam.start_draws(key, config), normals, uniforms
+    chance = jax.vmap(lambda step: fastslam.draws(key, step, config))(numbers)
+    draws = fastslam.start_draws(key, config), chance.normals, chance.uniform
     host = [jax.tree.map(np.asarray, tree) for tree in (final, trace, draws)]
     return *host, compiled, ran
+
+
+def _baseline_map(reference, params, config, identities, origin):
+    """`PointMap` of the best particle's landmarks that are confirmed and have a depth."""
+    # After resampling all weights are equal: the best particle lives on in its first child.
+    heir = int(np.argmax(reference.ancestors[-1] == reference.best[-1]))
+    particle = reference.particles[heir]
+    points, names = [], []
+    for slot, mark in enumerate(particle.landmarks):
+        if mark is None or (config.forgetting and mark.log_odds < params.existence_confirm):
+            continue
+        if config.sensor == "bearing" and not mark.mean[1] > 3 * np.sqrt(mark.cov[1, 1]):
+            continue  # no depth
+        points.append(baseline_ekf.point_of(mark, config.sensor)[0] + origin[:2])
+        names.append(identities[slot] if slot < len(identities) else -1)
+    return PointMap(np.reshape(points, (-1, 2)), np.array(names, np.int64))
 
 
 def _differences(state, trace, reference):

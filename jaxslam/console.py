@@ -30,7 +30,7 @@ OutLog = option(Path, "the log to write, a .npz file")
 def bar(what, compiles=False):
     """A progress bar on stderr; gives a function of (done, total), or None without a terminal.
 
-    `compiles`: until the first is done, JAX compiles.
+    `total` is None where no one knows. `compiles`: until the first is done, JAX compiles.
     """
     if not sys.stderr.isatty():
         yield None
@@ -60,3 +60,7 @@ def check_new(out, overwrite, what="a log", suffix=".npz"):
 
 def warn(text):
     print(f"warning: {text}", file=sys.stderr)
+
+
+def note(text):
+    print(f"note: {text}", file=sys.stderr)

@@ -199,12 +199,13 @@ def map_error(mean, identity, truth, motion=None):
     return found if known else found | {"gate_m": gate}
 
 
-def association_accuracy(result, log=None):
+def association_accuracy(result, log=None, match=None):
     """The share of measurements of known origin that were told apart rightly; NaN if there is none.
 
     A match is right if the measurement that created the landmark was of the same true landmark,
     "new" if no measurement of that landmark was called new before, "clutter" if it was clutter (a
     true identity of -1). Without true identities the measured ones serve, and -1 does not count.
+    `match` [T, K]: None for the filter's.
     """
     log = result.log if log is None else log
     identity = None if log.truth is None else log.truth.identity
@@ -212,7 +213,8 @@ def association_accuracy(result, log=None):
     identity = log.identity if identity is None else identity
     if identity is None or len(identity) == 0:
         return np.nan
-    row, match = np.asarray(result.row).ravel(), np.asarray(result.match).ravel()
+    row = np.asarray(result.row).ravel()
+    match = np.asarray(result.match if match is None else match).ravel()
     who = np.where(row >= 0, np.asarray(identity)[row.clip(0)], -1)
     counted = (match >= -2) & (row >= 0) & ((who >= 0) | clutter_known)
     # A landmark's label is the place (frame * K + k) of the measurement that created it.
@@ -230,6 +232,9 @@ def errors(result, log=None):
     """
     log = result.log if log is None else log
     found = {"association_accuracy": association_accuracy(result, log)}
+    if result.refined is not None:
+        again = association_accuracy(result, log, result.refined.match)
+        found["association_accuracy_refined"] = again
     if log.truth is not None:
         true = truth_at(log.truth, result.time)
         if with_truth(true).any():
@@ -239,52 +244,76 @@ def errors(result, log=None):
     return {key: value for key, value in found.items() if np.isfinite(value)}
 
 
+def paths(result):
+    """The paths [T, 3] that a run has, by name: filtered, ancestral, refined, dead_reckoning."""
+    found = {"filtered": result.pose}
+    for name in ("ancestral", "refined"):
+        if getattr(result, name) is not None:
+            found[name] = getattr(result, name).pose
+    return found | {"dead_reckoning": result.dead_reckoning}
+
+
 def path_errors(result, true, resolution):
     """The part of `errors` that needs true poses [T, 3]."""
-    have = with_truth(true)
-    found = {"truth_frames": int(have.sum())}
-    for name, path in (
-        ("ate_filtered", result.pose),
-        ("dead_reckoning_ate", result.dead_reckoning),
-    ):
-        aligned, unaligned = ate(path, true), ate(path, true, align=False)
-        # The names of summary.json: dead_reckoning_ate_m is the aligned RMSE.
-        rmse = f"{name}_rmse_m" if name == "ate_filtered" else f"{name}_m"
-        found |= {rmse: aligned[0], f"{name}_max_m": aligned[1]}
-        found |= {f"{name}_unaligned_rmse_m": unaligned[0], f"{name}_unaligned_max_m": unaligned[1]}
-    last = np.flatnonzero(have)[-1]
-    found["filtered_end_m"] = float(np.hypot(*(result.pose - true)[last, :2]))
-    found["dead_reckoning_end_m"] = float(np.hypot(*(result.dead_reckoning - true)[last, :2]))
-    heading = wrap(result.pose[:, 2] - true[:, 2])
-    if np.isfinite(heading).any():
-        found["heading_filtered_rmse_rad"] = float(np.sqrt(np.nanmean(heading**2)))
-    if resolution <= 0.1:  # coarser truth says nothing about one metre
-        found["rpe_1m_m"], found["rpe_1m_rad"] = rpe(result.pose, true)
-        found["dead_reckoning_rpe_1m_m"], found["dead_reckoning_rpe_1m_rad"] = rpe(
-            result.dead_reckoning, true
-        )
-    else:
+    found = {"truth_frames": int(with_truth(true).sum())}
+    if resolution > 0.1:  # coarser truth says nothing about one metre
         found["truth_resolution_m"] = float(resolution)
-    squared = nees(result.pose, result.cov, true, resolution)
-    if np.isfinite(squared).any():
-        squared = squared[np.isfinite(squared)]
-        found["nees_median"] = float(np.median(squared))
-        found["nees_within_99"] = float(np.mean(squared <= chi2.ppf(0.99, 3)))
+    for name, path in paths(result).items():
+        found |= _path_errors(name, path, true, resolution)
+    found |= _consistency("nees", result.pose, result.cov, true, resolution)
+    if result.refined is not None:
+        refined = result.refined
+        found |= _consistency("nees_refined", refined.pose, refined.cov, true, resolution)
     return found
 
 
+def _path_errors(name, path, true, resolution):
+    """Of one path [T, 3]; the names are those of summary.json."""
+    ours = name != "dead_reckoning"
+    (rmse, most), unaligned = ate(path, true), ate(path, true, align=False)
+    ate_name = f"ate_{name}" if ours else f"{name}_ate"
+    found = {f"{ate_name}_rmse_m" if ours else f"{ate_name}_m": rmse, f"{ate_name}_max_m": most}
+    found[f"{ate_name}_unaligned_rmse_m"], found[f"{ate_name}_unaligned_max_m"] = unaligned
+    last = np.flatnonzero(with_truth(true))[-1]
+    found[f"{name}_end_m"] = float(np.hypot(*(path - true)[last, :2]))
+    heading = wrap(path[:, 2] - true[:, 2])
+    if ours and np.isfinite(heading).any():
+        found[f"heading_{name}_rmse_rad"] = float(np.sqrt(np.nanmean(heading**2)))
+    if resolution <= 0.1:
+        kind = "" if name == "filtered" else f"{name}_"
+        found[f"{kind}rpe_1m_m"], found[f"{kind}rpe_1m_rad"] = rpe(path, true)
+    return found
+
+
+def _consistency(name, pose, cov, true, resolution):
+    squared = nees(pose, cov, true, resolution)
+    squared = squared[np.isfinite(squared)]
+    if not squared.size:
+        return {}
+    within = float(np.mean(squared <= chi2.ppf(0.99, 3)))
+    return {f"{name}_median": float(np.median(squared)), f"{name}_within_99": within}
+
+
 def landmark_errors(result, truth, true):
-    """The part of `errors` that needs true landmarks; aligned as the path [T, 3] is."""
+    """The part of `errors` that needs true landmarks; each map aligned as its path [T, 3] is."""
+    found = _landmark_errors("filtered", "landmarks", result.pose, result.landmarks, truth, true)
+    if result.refined is not None:
+        path, world = result.refined.pose, result.landmarks_refined
+        found |= _landmark_errors("refined", "landmarks_refined", path, world, truth, true)
+    return found
+
+
+def _landmark_errors(name, counts, path, landmarks, truth, true):
+    """Of one map, whose path is [T, 3]."""
     have = with_truth(true)
-    landmarks = result.landmarks
-    found = {}
-    kinds = {"landmark_filtered_unaligned": ("landmarks_unaligned", None)}
+    kinds = {"_unaligned": None}
     if alignable(true[have, :2]):
-        motion = align_se2(result.pose[have, :2], true[have, :2])
-        kinds["landmark_filtered"] = ("landmarks", motion)
-    for name, (counts, motion) in kinds.items():
+        kinds[""] = align_se2(path[have, :2], true[have, :2])
+    found = {}
+    for kind, motion in kinds.items():
         error = map_error(landmarks.mean, landmarks.identity, truth, motion)
-        found[f"{name}_rmse_m"] = error.get("rmse_m", np.nan)
+        found[f"landmark_{name}{kind}_rmse_m"] = error.get("rmse_m", np.nan)
         found["landmark_gate_m"] = error.get("gate_m", np.nan)
-        found |= {f"{counts}_{kind}": error[kind] for kind in ("matched", "missed", "spurious")}
+        for how in ("matched", "missed", "spurious"):
+            found[f"{counts}{kind}_{how}"] = error[how]
     return found

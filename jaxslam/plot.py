@@ -14,12 +14,13 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullFormatter
 
 from jaxslam.atomic import replacing
-from jaxslam.evaluate import truth_at, with_truth, wrap
+from jaxslam.evaluate import ate, paths, truth_at, with_truth, wrap
 
 FIGURES = ("map.png", "error.png", "particles.png")
 DPI = 150
 # Okabe and Ito's palette, told apart by the colour-blind too.
 TRUE, FILTER, RECKONING, LANDMARK, PLAN = "#222222", "#0072B2", "#E69F00", "#D55E00", "#9A9A9A"
+REFINED, ANCESTRAL = "#009E73", "#CC79A7"
 STYLE = {
     "font.size": 10,
     "axes.titlesize": 11,
@@ -81,15 +82,23 @@ def draw_map(result):
     reckoning = result.dead_reckoning
     axes.plot(*reckoning[:, :2].T, "--", color=RECKONING, lw=0.7, label="dead reckoning", zorder=1)
     axes.plot(*result.pose[:, :2].T, color=FILTER, lw=1.0, alpha=0.85, label="filter", zorder=3)
+    if result.refined is not None:
+        path = result.refined.pose
+        axes.plot(*path[:, :2].T, color=REFINED, lw=1.0, alpha=0.85, label="refined", zorder=3.5)
     axes.plot(*log.start_pose[:2], "D", ms=6, mec="white", color=FILTER, label="start", zorder=6)
     if log.truth is not None and log.truth.landmarks is not None:
         axes.plot(
             *log.truth.landmarks.T, "o", ms=9, mfc="none", mec=TRUE, label="true landmark", zorder=4
         )
-    outside = _draw_landmarks(axes, result.landmarks, low, high)
+    for world, sign, colour, label in (
+        (result.landmarks, "+", LANDMARK, "landmark"),
+        (result.landmarks_refined, "x", REFINED, "refined landmark"),
+    ):
+        if world is not None:
+            _draw_landmarks(axes, world, sign, colour, label)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal")
-    axes.set_title(_title(result, true, outside))
+    axes.set_title(_title(result, true, low, high))
     figure.legend(
         *axes.get_legend_handles_labels(),
         loc="outside lower center",
@@ -98,21 +107,19 @@ def draw_map(result):
     return figure
 
 
-def _draw_landmarks(axes, landmarks, low, high):
-    """Draw the estimated ones; returns how many lie outside the picture."""
+def _draw_landmarks(axes, landmarks, sign, colour, label):
+    """Draw a map: signs and ellipses, of what can be drawn."""
     mean, cov = np.reshape(landmarks.mean, (-1, 2)), np.reshape(landmarks.cov, (-1, 3))
     drawable = np.isfinite(mean).all(1) & np.isfinite(cov).all(1)
     mean, cov = mean[drawable], cov[drawable]
     if len(mean) == 0:
-        return 0
-    halo = [withStroke(linewidth=3.6, foreground="white")]
-    (plus,) = axes.plot(*mean.T, "+", ms=8, mew=1.8, color=LANDMARK, label="landmark", zorder=5)
-    plus.set_path_effects(halo)
+        return
+    (signs,) = axes.plot(*mean.T, sign, ms=7, mew=1.6, color=colour, label=label, zorder=5)
+    signs.set_path_effects([withStroke(linewidth=3.2, foreground="white")])
     outlines = LineCollection(
-        ellipses(mean, cov), colors=LANDMARK, linewidths=0.9, zorder=5, label=r"its 3$\sigma$"
+        ellipses(mean, cov), colors=colour, linewidths=0.9, zorder=5, label=r"its 3$\sigma$"
     )
     axes.add_collection(outlines, autolim=False)
-    return int(((mean < low) | (mean > high)).any(1).sum())
 
 
 def _draw_plan(axes, log, core):
@@ -150,8 +157,10 @@ def _limits(result, true):
     low, high = _corners(np.concatenate([*room, path]))
     core = _corners(np.concatenate(room)) if sum(map(len, room)) else (low, high)
     beyond = max((high - low).max() / 3, 0.5)
-    marks = np.reshape(result.landmarks.mean, (-1, 2))
-    loose = np.concatenate([result.dead_reckoning[:, :2], marks])
+    loose = [result.dead_reckoning[:, :2], np.reshape(result.landmarks.mean, (-1, 2))]
+    if result.refined is not None:
+        loose += [result.refined.pose[:, :2], result.refined.mean]
+    loose = np.concatenate(loose)
     loose = loose[((loose >= low - beyond) & (loose <= high + beyond)).all(1)]
     low, high = _corners(np.concatenate([loose, low[None], high[None]]))
     pad = 0.04 * (high - low).max() + 0.1
@@ -163,44 +172,63 @@ def _corners(points):
     return np.nanmin(points, 0), np.nanmax(points, 0)
 
 
-def _title(result, true, outside):
+def _title(result, true, low, high):
     config = result.config
     about = f"{config.sensor}, {config.association}".replace("_", " ")
     have = with_truth(true)
     told = "no true path"
     if have.any():
-        error = np.hypot(*(result.pose - true)[have, :2].T)
-        told = f"path error {np.sqrt(np.mean(error**2)):.2f} m RMSE"
-    count = f"{len(result.landmarks.mean)} landmarks"
-    count += f" ({outside} outside the picture)" if outside else ""
+        errors = [
+            f"{ate(path, true, align=False)[0]:.2f} m {name}"
+            for name, path in paths(result).items()
+            if name in ("filtered", "refined")
+        ]
+        told = f"path error {', '.join(errors)} (RMSE, not aligned)"
     return (
-        f"{result.log.name}: {about}, {config.particles:,} particles\n{told}, not aligned; {count}"
+        f"{result.log.name}: {about}, {config.particles:,} particles\n"
+        f"{told}; {_count(result, low, high)}"
     )
 
 
+def _count(result, low, high):
+    """How many landmarks there are, and how many of them the picture does not show."""
+    mean = np.reshape(result.landmarks.mean, (-1, 2))
+    outside = int(((mean < low) | (mean > high)).any(1).sum())
+    about = [f"{len(result.refined.mean)} refined"] if result.refined is not None else []
+    about += [f"{outside} outside the picture"] if outside else []
+    return f"{len(mean)} landmarks" + (f" ({', '.join(about)})" if about else "")
+
+
+LINES = {  # colour and label of every path
+    "filtered": (FILTER, "filter"),
+    "ancestral": (ANCESTRAL, "ancestral"),
+    "refined": (REFINED, "refined"),
+}
+
+
 def draw_error(result):
-    """Figure over time: position and heading error within the filter's own 3 sigma, and drift."""
+    """Figure over time: errors of position and heading beside their own 3 sigma, and drift."""
     figure = Figure(figsize=(9.5, 7.5), layout="constrained")
     position, heading, drift = figure.subplots(3, 1, sharex=True, height_ratios=(1.25, 1, 1))
     seconds, true = _seconds(result), truth_at(result.log.truth, result.time)
     known = with_truth(true).any()
-    error = np.hypot(*(result.pose - true)[:, :2].T)
-    turned = np.degrees(wrap(result.pose - true)[:, 2])
-    turned[1:][np.abs(np.diff(turned)) > 180] = np.nan  # no line across the whole panel
-    xx, xy, yy = result.cov[:, (0, 0, 1), (0, 1, 1)].T
-    largest = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)  # variance, in the worst direction
-    for axes, low, band in (
-        (position, 0, 3 * np.sqrt(largest.clip(0))),
-        (heading, -1, 3 * np.degrees(np.sqrt(result.cov[:, 2, 2].clip(0)))),
-    ):
-        fill = axes.fill_between(seconds, low * band, band, color=FILTER, alpha=0.22, lw=0)
-    fill.set_label(r"filter's own 3$\sigma$")
-    _curve(position, seconds, error, FILTER, label="filter")
-    _curve(heading, seconds, turned, FILTER)
-    _curve(drift, seconds, error, FILTER)
+    _draw_band(position, heading, seconds, result.cov, FILTER, r"filter's own 3$\sigma$")
+    if result.refined is not None:
+        cov = result.refined.cov
+        _draw_band(position, heading, seconds, cov, REFINED, r"refined's own 3$\sigma$")
     reference = true if known else result.pose
-    reckoning = np.hypot(*(result.dead_reckoning - reference)[:, :2].T)
-    _curve(drift, seconds, reckoning, RECKONING, "--", "dead reckoning")
+    for name, path in paths(result).items():
+        away = np.hypot(*(path - reference)[:, :2].T)
+        if name == "dead_reckoning":
+            _curve(drift, seconds, away, RECKONING, "--", "dead reckoning")
+            continue
+        colour, label = LINES[name]
+        turned = np.degrees(wrap(path - true)[:, 2])
+        turned[1:][np.abs(np.diff(turned)) > 180] = np.nan  # no line across the whole panel
+        _curve(position, seconds, np.hypot(*(path - true)[:, :2].T), colour, label=label)
+        _curve(heading, seconds, turned, colour)
+        if known or name != "filtered":
+            _curve(drift, seconds, away, colour)
     about = "errors, not aligned; gaps: no truth" if known else "the log has no truth"
     position.set(title=f"{result.log.name}: {about}", ylabel="position error [m]", ylim=(0, None))
     heading.set(ylabel="heading error [°]")
@@ -209,8 +237,20 @@ def draw_error(result):
     drift.set(title=about, ylabel=f"{measure} [m]", ylim=(0, None))
     _time_axis(drift, seconds)
     figure.align_ylabels()
-    figure.legend(loc="outside lower center", ncols=3)
+    figure.legend(loc="outside lower center", ncols=6)
     return figure
+
+
+def _draw_band(position, heading, seconds, cov, colour, label):
+    """Three sigma of poses [T, 3, 3]: of the position in the worst direction, and the heading."""
+    xx, xy, yy = cov[:, (0, 0, 1), (0, 1, 1)].T
+    largest = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
+    for axes, low, band in (
+        (position, 0, 3 * np.sqrt(largest.clip(0))),
+        (heading, -1, 3 * np.degrees(np.sqrt(cov[:, 2, 2].clip(0)))),
+    ):
+        fill = axes.fill_between(seconds, low * band, band, color=colour, alpha=0.22, lw=0)
+    fill.set_label(label)
 
 
 def _curve(axes, x, y, colour, style="-", label=None):
@@ -223,10 +263,15 @@ def _curve(axes, x, y, colour, style="-", label=None):
 
 def draw_particles(result):
     """Figure over time: effective sample size and resampling, landmarks made and freed, clutter."""
-    figure = Figure(figsize=(9.5, 7.0), layout="constrained")
-    sample, landmarks, clutter = figure.subplots(3, 1, sharex=True, height_ratios=(1.5, 1, 1))
+    past = result.ancestral
+    figure = Figure(figsize=(9.5, 7.0 if past is None else 8.6), layout="constrained")
+    heights = (1.5, 1, 1) if past is None else (1.5, 1, 1, 1)
+    panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
+    sample, landmarks, clutter = panels[[0, -2, -1]]
     seconds = _seconds(result)
     _draw_sample_size(sample, result, seconds)
+    if past is not None:
+        _draw_ancestors(panels[1], past.distinct, seconds, result.config.particles)
     for name, label, colour in (
         ("new", "created, best particle", FILTER),
         ("forgotten", "forgotten, mean of particles", LANDMARK),
@@ -242,10 +287,24 @@ def draw_particles(result):
     clutter.stairs(rejected, edges, color=LANDMARK, fill=True, label="called clutter")
     clutter.set(ylabel="per frame", ylim=(0, None))
     _time_axis(clutter, seconds)
-    for axes in (sample, landmarks, clutter):  # above the panel, where a legend hides nothing
+    for axes in panels:  # above the panel, where a legend hides nothing
         axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0.1)
     figure.align_ylabels()
     return figure
+
+
+def _draw_ancestors(axes, distinct, seconds, particles):
+    """How many ancestors the particles of the end have at each time; where it is one, in grey."""
+    axes.step(
+        seconds, distinct, color=ANCESTRAL, lw=1.4, where="post", label="ancestors of the end"
+    )
+    lone = np.flatnonzero(distinct == 1)
+    if lone.size:
+        label = "the past hangs on one"
+        axes.axvspan(0, seconds[lone[-1]], color=PLAN, alpha=0.25, lw=0, label=label)
+    axes.set(yscale="log", ylim=(0.8, particles * 1.3), ylabel="ancestors")
+    axes.yaxis.set_major_formatter("{x:,.0f}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _draw_sample_size(axes, result, seconds):

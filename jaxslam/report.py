@@ -1,7 +1,9 @@
 """A run's folder: written whole or not at all, and read back.
 
-`run.toml` reruns it, `summary.json` sums it up, `trajectory.tum` and `landmarks.csv` are for other
-tools, `events.jsonl` says when something happened, `steps.npz` holds every column of the result.
+`run.toml` reruns it, `summary.json` sums it up, `events.jsonl` says when something happened,
+`steps.npz` holds every column of the result. For other tools: `trajectory.tum` and `landmarks.csv`
+are the filter's, as it knew them at the time and at the end; `trajectory_refined.tum` and
+`landmarks_refined.csv` are what was refined afterwards, and are not there if nothing was.
 """
 
 import errno
@@ -30,7 +32,11 @@ COLUMNS = (
     *("log_evidence", "nonfinite", "degenerate", "match", "row", "dead_reckoning"),
 )
 NEEDED = ("run.toml", "summary.json", "steps.npz")  # without these it is no run's folder
-FILES = (*NEEDED, "trajectory.tum", "landmarks.csv", "events.jsonl", "log.npz", *plot.FIGURES)
+LOOKING_BACK = ("ancestral", "lineage", "refined")  # columns of what a run need not have
+FILES = (
+    *(*NEEDED, "trajectory.tum", "landmarks.csv", "events.jsonl", "log.npz", *plot.FIGURES),
+    *("trajectory_refined.tum", "landmarks_refined.csv"),
+)
 
 
 def save(result, directory, overwrite=False, log_source=None, figures=True):
@@ -93,7 +99,7 @@ def load(directory, log=None):
 
     Raises `ValueError` if a file is missing or broken, or if the log isn't the run's.
     """
-    from jaxslam.runner import Result  # here, since the runner's results save themselves
+    from jaxslam.result import MapEstimate, Result  # here, since results save themselves
 
     directory = Path(directory)
     try:
@@ -105,9 +111,11 @@ def load(directory, log=None):
             np.load(file, allow_pickle=False) as steps,
         ):
             columns = {name: steps[name] for name in COLUMNS}
-            landmarks = {name[4:]: steps[name] for name in steps.files if name.startswith("map_")}
+            landmarks = MapEstimate(**_part("map", steps))
+            columns |= _looking_back(steps)
         seed, source = told["seed"], told["log"]
         spent = {name: summary[name] for name in ("seconds", "compile_seconds", "dropped")}
+        spent["refine_seconds"] = summary.get("refine_seconds")
     except FileNotFoundError as error:
         raise ValueError(
             f"{directory}: no {Path(error.filename).name}; not a run's folder"
@@ -122,17 +130,30 @@ def load(directory, log=None):
         config=config,
         params=params,
         seed=seed,
-        landmarks=map_estimate(landmarks),
+        landmarks=landmarks,
         **columns,
         **spent,
     )
 
 
-def map_estimate(columns):
-    """The `MapEstimate` with these columns."""
-    from jaxslam.runner import MapEstimate
+def _part(name, steps):
+    """The columns of `steps.npz` whose names begin so, without that; numbers as numbers."""
+    begin = f"{name}_"
+    columns = {key[len(begin) :]: steps[key] for key in steps.files if key.startswith(begin)}
+    return {key: value if value.ndim else value.item() for key, value in columns.items()}
 
-    return MapEstimate(**columns)
+
+def _looking_back(steps):
+    """What a run found out looking back, as far as it is there: older folders have none of it."""
+    from jaxslam.smoothing import Ancestral, Lineage
+
+    found = {name: _part(name, steps) for name in LOOKING_BACK}
+    kinds = {"ancestral": Ancestral, "lineage": Lineage}
+    if found["refined"]:
+        from jaxslam.refine import Refined  # brings JAX, which nothing else here needs
+
+        kinds["refined"] = Refined
+    return {name: kind(**found[name]) for name, kind in kinds.items() if found[name]}
 
 
 def evaluate_folder(directory, log=None):
@@ -161,9 +182,26 @@ def summarise(result):
         "dropped_measurements": int(sum(result.dropped.values())),
         "dropped": dict(result.dropped),
         "warnings": list(result.flags),
+        "advice": list(result.advice),
+        **_looked_back(result),
         "versions": versions(),
         **errors(result),
     }
+
+
+def _looked_back(result):
+    """The part of `summarise` about the genealogy and the refinement; without them, empty."""
+    told = {}
+    if result.ancestral is not None:
+        told["least_ancestors"] = int(np.min(result.ancestral.distinct, initial=2**31))
+    if (found := result.refined) is not None:
+        told |= {
+            "refine_seconds": result.refine_seconds,
+            "refine_rounds": int(found.rounds),
+            "refine_converged": bool(found.converged),
+            "n_landmarks_refined": len(found.mean),
+        }
+    return told
 
 
 def versions():
@@ -225,66 +263,27 @@ def run_toml(result, log):
     return "\n".join(lines) + "\n"
 
 
-def error_table(summary):
-    """The errors of a summary as text for people: the filter's beside dead reckoning's."""
-    text = []
-    if "ate_filtered_unaligned_rmse_m" in summary:
-        head = ("", "aligned RMSE", "unaligned RMSE", "unaligned max", "at the end")
-        text.append(_row(head))
-        for name, prefix, end in (
-            ("path, filter", "ate_filtered", "filtered_end_m"),
-            ("path, dead reckoning", "dead_reckoning_ate", "dead_reckoning_end_m"),
-        ):
-            aligned = f"{prefix}_rmse_m" if prefix == "ate_filtered" else f"{prefix}_m"
-            keys = (aligned, f"{prefix}_unaligned_rmse_m", f"{prefix}_unaligned_max_m", end)
-            text.append(_row((name, *(_metres(summary, key) for key in keys))))
-    if "landmarks_unaligned_matched" in summary:
-        keys = ("landmark_filtered_rmse_m", "landmark_filtered_unaligned_rmse_m")
-        text.append(_row(("landmarks", *(_metres(summary, key) for key in keys))))
-        for kind, place in (("landmarks", "aligned: "), ("landmarks_unaligned", "unaligned: ")):
-            if f"{kind}_matched" in summary:
-                told = [f"{summary[f'{kind}_{k}']} {k}" for k in ("matched", "missed", "spurious")]
-                text.append(f"{place:>24}{', '.join(told)}")
-        gate = summary.get("landmark_gate_m")
-        text[-1] += f" (gate {gate:.2f} m)" if gate is not None else " (paired by identity)"
-    for key, label, scale, unit in (
-        ("heading_filtered_rmse_rad", "heading, filter", 180 / np.pi, "° RMSE, unaligned"),
-        ("rpe_1m_m", "per metre, filter", 1, " m"),
-        ("dead_reckoning_rpe_1m_m", "per metre, reckoning", 1, " m"),
-        ("association_accuracy", "association", 100, " % right"),
-        ("nees_median", "pose NEES, median", 1, " (2.37 if the filter knew its error)"),
-        ("nees_within_99", "within its 99 % region", 100, " % of frames"),
-        ("truth_resolution_m", "truth read to", 1, " m"),
-    ):
-        if key in summary:
-            value = summary[key] * scale
-            number = f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
-            text.append(f"{label:24}{number}{unit}")
-    return "\n".join(text) if text else "The log has no truth to compare with."
-
-
-def _row(cells):
-    return f"{cells[0]:24}" + "".join(f"{cell:>16}" for cell in cells[1:])
-
-
-def _metres(summary, key):
-    return f"{summary[key]:.3f} m" if key in summary else "-"
-
-
 def _write_files(result, folder, source):
     if source is None:
         save_log(folder / "log.npz", result.log)
         source = "log.npz"
-    landmarks = {f"map_{name}": column for name, column in result.landmarks._asdict().items()}
     columns = {name: np.asarray(getattr(result, name)) for name in COLUMNS}
-    np.savez_compressed(folder / "steps.npz", **columns, **landmarks)
-    for name, lines in {
+    tables = {"map": result.landmarks} | {name: getattr(result, name) for name in LOOKING_BACK}
+    for name, table in tables.items():
+        if table is not None:
+            columns |= {f"{name}_{key}": np.asarray(v) for key, v in table._asdict().items()}
+    np.savez_compressed(folder / "steps.npz", **columns)
+    files = {
         "run.toml": [run_toml(result, source)],
         "trajectory.tum": tum_lines(result.time, result.pose),
         "landmarks.csv": landmark_lines(result.landmarks),
         "events.jsonl": event_lines(result),
         "summary.json": [_json(summarise(result), indent=2) + "\n"],
-    }.items():
+    }
+    if result.refined is not None:
+        files["trajectory_refined.tum"] = tum_lines(result.time, result.refined.pose)
+        files["landmarks_refined.csv"] = landmark_lines(result.landmarks_refined)
+    for name, lines in files.items():
         with open(folder / name, "w", encoding="utf-8", newline="\n") as file:
             file.writelines(lines)
 

@@ -1,10 +1,14 @@
 """A small result made by hand, for the tests of what comes after the filter."""
 
+import dataclasses
+
 import numpy as np
 
 from jaxslam.config import Config, Params
 from jaxslam.log import FloorPlan, Log, Truth
-from jaxslam.runner import MapEstimate, Result
+from jaxslam.refine import Refined
+from jaxslam.result import MapEstimate, Result
+from jaxslam.smoothing import Ancestral, Lineage
 
 LANDMARKS = np.array([[3.0, 0.0], [0.0, 3.0], [-3.0, 0.0], [0.0, -3.0]])
 START = 1_700_000_000_123_456_789  # ns
@@ -76,4 +80,35 @@ def make_result(frames=40, truth=True, shift=0.1):
         seconds=1.25,
         compile_seconds=0.5,
         dropped={"no measurement slot": 3},
+    )
+
+
+def make_refined(frames=40, truth=True, shift=0.1):
+    """The same, looking back: the ancestral path is off by 0.8 shifts, the refined one by half."""
+    result = make_result(frames, truth, shift)
+    back = np.array([shift, 0, 0])
+    world = result.landmarks
+    few = slice(0, 4)
+    return dataclasses.replace(
+        result,
+        ancestral=Ancestral(result.pose - 0.2 * back, result.cov / 2, np.arange(frames) // 10 + 1),
+        lineage=Lineage(result.pose - 0.3 * back, result.match),
+        refined=Refined(
+            pose=result.pose - 0.5 * back,
+            cov=result.cov / 4,
+            id=world.id[few],
+            mean=world.mean[few] - 0.5 * back[:2],
+            landmark_cov=world.cov[few] / 4,
+            n=world.n[few],
+            identity=world.identity[few],
+            match=np.where(np.arange(frames)[:, None] == 8, -2, result.match),
+            rounds=3,
+            iterations=20,
+            cost=-12.5,
+            converged=True,
+            merged=1,
+            dropped=0,
+            residual=0.9,
+        ),
+        refine_seconds=0.75,
     )

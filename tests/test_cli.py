@@ -12,11 +12,11 @@ import zipfile
 import numpy as np
 import pytest
 
-from jaxslam import cli, compare, console, report, runner, simulate
+from jaxslam import cli, compare, console, report, runner, simulate, variants
 from jaxslam.log import load_log, save_log
 
 COMMANDS = ("demo", "run", "compare", "convert", "check", "evaluate", "plot")
-MANY = ("--particles", "50")
+MANY = ("--particles", "50", "--no-refine")
 
 
 @pytest.fixture(scope="session")
@@ -62,15 +62,24 @@ def test_from_csv_files_to_errors_and_figures(at, call):
     code, out, _ = call("check", "robot.npz")
     assert code == 0
     assert "48 measurements" in out
-    code, out, err = call("run", "robot.npz", "--association", "known", *MANY, "--out", "result")
-    assert (code, err) == (0, "")
-    assert "path, filter" in out
+    run = "run", "robot.npz", "--association", "known", "--particles", "50", "--out", "result"
+    code, out, err = call(*run)
+    assert code == 0
+    # Advice is no warning: the exit code does not tell of it.
+    assert err.startswith("note: up to ") and err.count("\n") == 1
+    for label in ("path, filter", "path, ancestral", "path, refined", "landmarks, refined"):
+        assert label in out
+    assert "; refined in " in out.splitlines()[-2]
     assert "result" in out.splitlines()[-1]
     summary = json.loads((at / "result" / "summary.json").read_text())
     assert (summary["n_particles"], summary["n_landmarks"]) == (50, 3)
+    assert (summary["n_landmarks_refined"], summary["least_ancestors"]) == (3, 1)
+    assert summary["advice"] == [err.removeprefix("note: ").rstrip()]
+    assert len((at / "result" / "landmarks_refined.csv").read_text().splitlines()) == 4
     errors = json.loads(call("evaluate", "result", "--json")[1])
     assert errors["truth_frames"] == 16
     assert errors["ate_filtered_unaligned_rmse_m"] < 0.2
+    assert errors["ate_refined_unaligned_rmse_m"] < 0.1
     assert errors.items() <= summary.items()
     (at / "result" / "map.png").unlink()
     assert call("plot", "result")[1].splitlines()[0].endswith("map.png")
@@ -88,6 +97,7 @@ def test_simulate_run_again_and_moved_log(at, call, refuse):
     told = (folder / "run.toml").read_text()
     assert "exclusive = false" in told
     assert "seed = 3" in told
+    assert not (folder / "trajectory_refined.tum").exists()  # as asked
     assert "exists; choose another folder or add --overwrite" in refuse(*run)
     (at / "world.npz").rename(at / "moved.npz")
     assert "--log" in refuse("evaluate", folder)
@@ -165,14 +175,23 @@ def test_compare_shows_both(log, call, monkeypatch, same):
         asked.append((config.particles, config.sensor, config.exclusive, seed, steps, every))
         poses = np.zeros((8, 3))
         double = compare.Agreement(
-            8, config.particles, same, *[0.0] * 3, 1, *[0.0] * 4, poses, poses, 2.0, 0.1, 0.3
+            8, config.particles, same, *[0.0] * 3, 1, *[0.0] * 4, poses, poses, 2.0, 0.1, 0.3, None
         )
         return compare.Comparison(double, double, 0.125, 0.25)
 
     monkeypatch.setattr(compare, "compare", stub)
+
+    def side_by_side(given, config, params, seed, steps, every, baselines, progress):
+        asked.append((config.particles, seed, steps, every, len(baselines)))
+        return [variants.Variant("informed", 70, 0.5, 0.75, np.nan, (3, 1, 0), 0.002)]
+
+    monkeypatch.setattr(variants, "variants", side_by_side)
     words = ["--particles", "3,5", "--paper", "--seed", 2, "--steps", 8, "--every", 4]
-    code, out, err = call("compare", log, *words)
-    assert asked == [(n, "position", False, 2, 8, 4) for n in (3, 5)]
+    code, out, err = call("compare", log, *words, "--variants", 70)
+    assert asked == [*((n, "position", False, 2, 8, 4) for n in (3, 5)), (70, 2, 8, 4, 2)]
+    told = out.splitlines()[-1].split()
+    assert told == ["informed", "70", "0.500", "m", "0.750", "m", "-", "3/1/0", "2", "ms"]
+    assert call("compare", log, *words, "--variants", 0)[1] == out[: out.index("\n\n") + 1]
     assert out.splitlines()[0].split() == ["3", "particles", "5", "particles"]
     assert out.count(f"{same} of 8 steps") == 4
     for text in ("0.125 m RMSE", "0.250 m RMSE", "250 ms", "50 ms", "12.5 ms", "20 times"):
@@ -187,8 +206,8 @@ def test_lost_data_are_warnings(at, call, short):
     code, out, err = call(*run, "--landmarks", "2")
     assert code == 1
     assert "path, filter" in out
-    assert err.startswith("warning: the map was full from frame ")
-    assert err.count("\n") == 1
+    assert err.splitlines()[-1].startswith("warning: the map was full from frame ")
+    assert err.count("warning:") == 1
     write_csv(at)
     lines = (at / "seen.csv").read_text().splitlines()
     (at / "seen.csv").write_text("\n".join([*lines[:9], "oops,1,1,1", *lines[9:], ""]))
@@ -298,7 +317,7 @@ def test_usage(log, refuse):
 def test_too_little_memory_is_told_and_a_fault_of_ours_not_hidden(log, refuse, monkeypatch):
     texts = ["RESOURCE_EXHAUSTED: Out of memory allocating 64 GB.\nmore lines", "a bug"]
 
-    def run(*given):
+    def run(*given, **named):
         raise RuntimeError(texts.pop(0))
 
     monkeypatch.setattr(runner, "run", run)
@@ -309,7 +328,7 @@ def test_too_little_memory_is_told_and_a_fault_of_ours_not_hidden(log, refuse, m
 
 @pytest.mark.parametrize("place", ["runner.run", "report.summarise"])
 def test_interrupted_while_filtering_or_writing_leaves_nothing(log, call, monkeypatch, place):
-    def interrupted(*given):
+    def interrupted(*given, **named):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(f"jaxslam.{place}", interrupted)
@@ -363,6 +382,8 @@ def test_a_terminal_gets_a_bar_and_a_file_does_not(capsys, monkeypatch):
     with console.bar("filtering", compiles=True) as show:
         show(0, 8)
         show(4, 8)
+    with console.bar("refining") as show:
+        show(3, None)
     out, err = capsys.readouterr()
     assert out == ""
-    assert err.index("filtering: compiling… (once)") < err.index("50%")
+    assert err.index("filtering: compiling… (once)") < err.index("50%") < err.index("refining")

@@ -7,14 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import baseline, compare, simulate
-from jaxslam.config import ASSOCIATIONS, SENSORS, Config, default_params
+from jaxslam import baseline, compare, simulate, variants
+from jaxslam.config import SENSORS, Config, default_params
 from jaxslam.frames import frames
 from jaxslam.log import load_log
 
 STEPS, PARTICLES = 200, 20
 # More than one block, a map that can fill up, and frames with more measurements than slots.
 SIZES = {"particles": PARTICLES, "measurements": 4, "landmarks": 20, "block": 10}
+SIZES |= {"proposal": "prior"}  # the only one the baseline has
 # Landmarks are either crowded, or so rare that nearby (range below 2 m) clutter is likelier.
 DENSITY_NEW = {"position": 0.5, "range_bearing": 1e-3, "bearing": 0.05}
 
@@ -41,7 +42,7 @@ def assert_agree(log, config):
     return found
 
 
-@pytest.mark.parametrize("association", ASSOCIATIONS)
+@pytest.mark.parametrize("association", ["maximum_likelihood", "known"])
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_baseline_and_filter_agree(woods, sensor, association):
     config = Config(sensor=sensor, association=association, forgetting=True, **SIZES)
@@ -72,7 +73,7 @@ def test_baseline_and_filter_agree_on_the_papers_rules(woods):
 
 def small(steps=12):
     log = simulate.planar(length_m=steps * 0.1, landmarks=12, outlier=0.2, seed=3)
-    return log, Config(particles=4, measurements=4, landmarks=3)
+    return log, Config(particles=4, measurements=4, landmarks=3, proposal="prior")
 
 
 def test_comparison_in_both_precisions():
@@ -90,6 +91,56 @@ def test_comparison_in_both_precisions():
     text = compare.table([row, row])
     assert "10 of 10 steps" in text
     assert len({len(line) for line in text.splitlines()}) == 1
+
+
+def test_the_baseline_refuses_what_it_has_not():
+    log, config = small()
+    for other in ({"proposal": "informed"}, {"association": "sampled"}):
+        with pytest.raises(ValueError, match="the baseline has the prior proposal"):
+            compare.agreement(log, replace(config, **other))
+
+
+@pytest.fixture(scope="module")
+def side_by_side():
+    log = simulate.planar("field", 5, landmarks=15, length_m=12.0, rate_hz=2.0)
+    config = Config(particles=30, measurements=8, landmarks=24)
+    few = replace(config, particles=5)
+    baselines = [compare.compare(log, few, steps=40, every=1)]
+    return log, baselines, variants.variants(log, config, None, 0, 40, 1, baselines)
+
+
+def test_variants_stand_side_by_side(side_by_side):
+    log, _, rows = side_by_side
+    names = ["baseline, NumPy", "Config.paper()", "FastSLAM 1.0", "informed", "refined"]
+    assert [row.name for row in rows] == names
+    assert [row.particles for row in rows] == [5, 30, 30, 30, 30]
+    for row in rows:
+        assert 0 < row.aligned < row.unaligned < 0.5
+        assert 0 < row.landmarks < 0.5
+        matched, missed, _ = row.counts
+        assert matched > 5 and matched + missed == len(log.truth.landmarks)
+    assert rows[-1].aligned < rows[2].aligned
+    lines = variants.table(rows).splitlines()
+    assert [line[:16].strip() for line in lines[1:]] == names
+    assert f"{rows[0].unaligned:.3f} m" in lines[1]
+
+
+def test_the_baselines_map_is_that_of_its_best_particle(side_by_side):
+    log, (row,), _ = side_by_side
+    world = row.double.map_baseline
+    assert world.mean.shape == (len(world.identity), 2)
+    assert (world.identity == -1).all()  # identities were hidden
+    nearest = np.hypot(*(world.mean[:, None] - log.truth.landmarks).T).min(0)
+    assert len(nearest) > 5 and np.median(nearest) < 0.3
+
+
+def test_variants_without_truth_have_times_only():
+    log = small()[0]
+    pose = np.zeros((len(log.frame_time), 3))
+    world = compare.PointMap(np.ones((2, 2)), np.array([-1, -1]))
+    row = variants._measured("x", replace(log, truth=None), 7, pose, world, 3.0 * len(pose))
+    assert np.isnan([row.aligned, row.unaligned, row.landmarks]).all()
+    assert " ".join(variants.table([row]).splitlines()[1].split()) == "x 7 - - - - 3000 ms"
 
 
 def traces(steps=3, particles=2):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 from scipy.stats import chi2
-from small_run import LANDMARKS, make_result
+from small_run import LANDMARKS, make_refined, make_result
 
 from jaxslam import evaluate
 from jaxslam.log import Truth
@@ -196,6 +196,28 @@ def test_errors_of_a_shifted_run_are_the_shift_and_nothing_after_alignment():
     assert found["nees_median"] == pytest.approx(0.1**2 / 0.01)
     assert found["association_accuracy"] == 1
     assert all(isinstance(value, int | float) for value in found.values())
+
+
+def test_what_looks_back_is_measured_as_the_filter_is():
+    plain, found = evaluate.errors(make_result()), evaluate.errors(make_refined())
+    assert plain.items() <= found.items()
+    assert not [key for key in plain if "refined" in key or "ancestral" in key]
+    for name, off in (("filtered", 0.1), ("ancestral", 0.08), ("refined", 0.05)):
+        assert found[f"ate_{name}_rmse_m"] == pytest.approx(0, abs=1e-9)
+        for kind in ("rmse", "max"):
+            assert found[f"ate_{name}_unaligned_{kind}_m"] == pytest.approx(off)
+        assert found[f"{name}_end_m"] == pytest.approx(off)
+        assert found[f"heading_{name}_rmse_rad"] == pytest.approx(0, abs=1e-9)
+    for name in ("ancestral", "refined", "dead_reckoning"):
+        assert found[f"{name}_rpe_1m_m"] >= 0
+    assert found["landmark_refined_unaligned_rmse_m"] == pytest.approx(0.05)
+    assert found["landmark_refined_rmse_m"] == pytest.approx(0, abs=1e-9)
+    for counts in ("landmarks_refined", "landmarks_refined_unaligned"):
+        told = [found[f"{counts}_{kind}"] for kind in ("matched", "missed", "spurious")]
+        assert told == [4, 0, 0]
+    assert found["nees_refined_median"] == pytest.approx(0.05**2 / (0.01 / 4))
+    assert found["nees_refined_within_99"] == 1
+    assert found["association_accuracy_refined"] == pytest.approx(1 - 1 / 80)
 
 
 def test_errors_leave_out_what_cannot_be_computed():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
-from small_run import make_log, make_result
+from small_run import make_log, make_refined, make_result
 
 from jaxslam import plot, report
 from jaxslam.log import FloorPlan
@@ -73,9 +73,18 @@ def test_map_says_what_it_shows():
     legend, title = texts(plot.draw_map(make_result()))
     for entry in ("true path", "filter", "dead reckoning", "landmark", "true landmark"):
         assert entry in legend
-    for words in ("circle", "range bearing", "100 particles", "0.10 m RMSE, not aligned"):
+    for words in (
+        "circle",
+        "range bearing",
+        "100 particles",
+        "0.10 m filtered (RMSE, not aligned)",
+    ):
         assert words in title
     assert "5 landmarks (1 outside the picture)" in title
+    legend, title = texts(plot.draw_map(make_refined()))
+    assert {"refined", "refined landmark"} < set(legend)
+    assert "path error 0.10 m filtered, 0.05 m refined (RMSE, not aligned)" in title
+    assert "5 landmarks (4 refined, 1 outside the picture)" in title
     legend, title = texts(plot.draw_map(make_result(truth=False)))
     assert "true path" not in legend
     assert "no true path" in title
@@ -104,6 +113,26 @@ def test_error_is_drawn_only_where_truth_is():
 def test_the_band_is_three_sigma_of_the_worst_direction():
     band = plot.draw_error(make_result()).axes[0].collections[0]
     assert band.get_paths()[0].vertices[:, 1].max() == pytest.approx(3 * np.sqrt(0.02))
+
+
+def test_every_path_has_its_error_over_time():
+    figure = plot.draw_error(make_refined())
+    told = texts(figure)[0]
+    assert {"filter", "ancestral", "refined", "dead reckoning"} < set(told)
+    assert {r"filter's own 3$\sigma$", r"refined's own 3$\sigma$"} < set(told)
+    position = figure.axes[0]
+    curves = {line.get_label(): line.get_ydata() for line in position.lines}
+    for label, off in (("filter", 0.1), ("ancestral", 0.08), ("refined", 0.05)):
+        np.testing.assert_allclose(curves[label], off)
+    bands = [band.get_paths()[0].vertices[:, 1].max() for band in position.collections]
+    np.testing.assert_allclose(bands, 3 * np.sqrt([0.02, 0.005]))
+
+
+def test_the_past_that_hangs_on_one_is_marked():
+    axes = plot.draw_particles(make_refined()).axes
+    assert len(axes) == len(plot.draw_particles(make_result()).axes) + 1
+    np.testing.assert_array_equal(axes[1].lines[0].get_ydata(), np.arange(40) // 10 + 1)
+    assert axes[1].patches[0].get_width() == pytest.approx(1.8)  # s
 
 
 def shown_readings(log):
@@ -149,11 +178,11 @@ ODD = {
 
 @pytest.mark.parametrize("oddity", ODD)
 def test_odd_results_are_drawn_too(tmp_path, oddity):
-    assert len(pictures(ODD[oddity](make_result()), tmp_path / "a")) == 3
+    assert len(pictures(ODD[oddity](make_refined()), tmp_path / "a")) == 3
 
 
 def test_one_frame_is_drawn_too(tmp_path):
-    assert len(pictures(make_result(frames=1), tmp_path / "a")) == 3
+    assert len(pictures(make_refined(frames=1), tmp_path / "a")) == 3
 
 
 def test_saved_runs_are_drawn_anew(tmp_path):

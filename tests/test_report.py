@@ -7,10 +7,11 @@ import tomllib
 
 import numpy as np
 import pytest
-from small_run import LANDMARKS, START, make_log, make_result
+from small_run import LANDMARKS, START, make_log, make_refined, make_result
 
 from jaxslam import evaluate, report
 from jaxslam.config import Config, Params
+from jaxslam.error_table import error_table
 from jaxslam.log import Truth, save_log
 
 NAME = "lost-in-the-woods"
@@ -28,8 +29,9 @@ def same(a, b):
     return np.array_equal(a, b) and np.asarray(a).dtype == np.asarray(b).dtype
 
 
-def test_what_is_saved_is_loaded_again(tmp_path):
-    result = make_result()
+@pytest.mark.parametrize("make", [make_result, make_refined])
+def test_what_is_saved_is_loaded_again(tmp_path, make):
+    result = make()
     report.save(result, tmp_path / "run", figures=False)
     loaded = report.load(tmp_path / "run")
     for item in dataclasses.fields(result):
@@ -37,6 +39,40 @@ def test_what_is_saved_is_loaded_again(tmp_path):
             assert same(getattr(loaded, item.name), getattr(result, item.name)), item.name
     assert loaded.params == tuple(map(float, result.params))
     assert report.evaluate_folder(tmp_path / "run") == evaluate.errors(result)
+
+
+def test_what_was_refined_has_files_of_its_own(tmp_path):
+    report.save(make_result(), tmp_path / "run", figures=False)
+    before = contents(tmp_path / "run")
+    assert not [name for name in before if "refined" in name]
+    report.save(make_refined(), tmp_path / "run", overwrite=True, figures=False)
+    after = contents(tmp_path / "run")
+    assert set(after) - set(before) == {"trajectory_refined.tum", "landmarks_refined.csv"}
+    for name in ("trajectory.tum", "landmarks.csv", "events.jsonl"):
+        assert after[name] == before[name]  # the filter stays what it is
+    result = make_refined()
+    path = np.loadtxt(tmp_path / "run" / "trajectory_refined.tum")
+    np.testing.assert_allclose(path[:, 1:3], result.refined.pose[:, :2], atol=1e-9)
+    lines = after["landmarks_refined.csv"].decode().splitlines()
+    assert lines[0] == "id,x,y,sxx,sxy,syy,n"
+    table = np.loadtxt(lines[1:], delimiter=",")
+    np.testing.assert_array_equal(table[:, 1:3], result.refined.mean)
+    np.testing.assert_array_equal(table[:, 3:6], result.refined.landmark_cov)
+    report.save(make_result(), tmp_path / "run", overwrite=True, figures=False)
+    assert not [name for name in contents(tmp_path / "run") if "refined" in name]
+
+
+def test_summary_of_what_looks_back():
+    plain, summary = report.summarise(make_result()), report.summarise(make_refined())
+    told = dict(refine_seconds=0.75, refine_rounds=3, refine_converged=True, least_ancestors=1)
+    told |= dict(n_landmarks_refined=4, n_landmarks=5)
+    assert summary | told == summary
+    assert not told.keys() - {"n_landmarks"} & plain.keys()
+    assert summary["warnings"] == plain["warnings"]
+    assert summary["advice"] == [
+        "up to 1.8 s, 25% of the path, all particles descend from one: "
+        "there the ancestral covariance says nothing"
+    ]
 
 
 def test_run_toml_resolves_everything(tmp_path):
@@ -239,14 +275,26 @@ def test_broken_folders_are_named(tmp_path):
 
 def test_error_table_puts_dead_reckoning_beside_the_filter():
     found = evaluate.errors(make_result())
-    lines = report.error_table(found).splitlines()
+    lines = error_table(found).splitlines()
     assert lines[0].split() == HEAD
     assert lines[1].split() == ["path,", "filter", "0.000", "m", *["0.100", "m"] * 3]
     assert lines[2].startswith("path, dead reckoning")
     assert lines[2].split()[-2] == f"{found['dead_reckoning_end_m']:.3f}"
-    assert "4 matched, 0 missed, 1 spurious (gate 0.50 m)" in report.error_table(found)
+    assert "4 matched, 0 missed, 1 spurious (gate 0.50 m)" in error_table(found)
+    assert "refined" not in error_table(found) and "ancestral" not in error_table(found)
     only_map = dataclasses.replace(make_log(), truth=Truth(landmarks=LANDMARKS))
-    table = report.error_table(evaluate.errors(make_result(), only_map))
+    table = error_table(evaluate.errors(make_result(), only_map))
     assert "path" not in table
     assert "0.100 m" in table
-    assert "no truth" in report.error_table({})
+    assert "no truth" in error_table({})
+
+
+def test_error_table_shows_every_path_and_both_maps():
+    lines = error_table(evaluate.errors(make_refined())).splitlines()
+    labels = [line[:24].strip() for line in lines[1:5]]
+    assert labels == [f"path, {n}" for n in ("filter", "ancestral", "refined", "dead reckoning")]
+    assert [line.split()[-2] for line in lines[1:4]] == ["0.100", "0.080", "0.050"]
+    at = [line[:24].strip() for line in lines].index("landmarks, refined")
+    assert lines[at].split()[2:] == ["0.000", "m", "0.050", "m"]
+    assert lines[at + 1].endswith("4 matched, 0 missed, 0 spurious")
+    assert [line.split()[-3] for line in lines if line.startswith("association")] == ["100", "98.8"]
