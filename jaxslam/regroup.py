@@ -10,7 +10,8 @@ import numpy as np
 
 from jaxslam import bundle, sensors
 
-ALIKE = 13.8  # squared Mahalanobis distance of one place from itself, at most (0.999, chi2 of 2)
+ALIKE = 9.2  # squared Mahalanobis distance of one place from itself, at most (0.99, chi2 of 2)
+STAY = 1.0  # nats by which another landmark must be the better one: near ties would alternate
 NEAR = 0.5  # m between two halves of one landmark, at most
 TOGETHER = 0.02  # of the frames of the rarer half of one landmark, how many may show both
 UNRIPE = 3.0  # standard deviations of its position by which a bearing-only landmark is away
@@ -56,7 +57,7 @@ def checked(given, fit, groups, known):
     merged = 0
     if not known:
         seen = _seen(given, fit, which)
-        into = _alike(fit, seen)
+        into = _alike(given, fit, which, seen)
         merged = int(np.sum(into != np.arange(len(rows))))
         if merged:  # their points are of one half each: solve before anything is judged by them
             which = np.where(which >= 0, into[which], -1)
@@ -150,14 +151,21 @@ def _seen(given, fit, which):
     return seen
 
 
-def _alike(fit, seen):
-    """Of every point [L] the one it becomes: itself, or the other half, measured more often."""
+def _alike(given, fit, which, seen):
+    """Of every point [L] the one it becomes: itself, or the other half, measured more often.
+
+    To the joint covariance comes the noise of one measurement: what is alike for a measurement,
+    errors that are not independent do not set apart.
+    """
     size = len(fit.points)
     into = np.arange(size)
     off = fit.points[:, None] - fit.points[None]
     cov = fit.factor.points.reshape(size, 2, size, 2).transpose(0, 2, 1, 3)
     own = cov[into, into]
-    spread = own[:, None] + own[None] - cov - cov.transpose(0, 1, 3, 2) + 1e-12 * np.eye(2)
+    number = np.bincount(which[which >= 0], (fit.weight * given.share)[which >= 0], size)
+    each = fit.information / np.maximum(number, 1e-12)[:, None, None]
+    once = 2 * np.linalg.inv(each[:, None] + each[None])
+    spread = own[:, None] + own[None] - cov - cov.transpose(0, 1, 3, 2) + once
     square = np.einsum("ija,ija->ij", off, np.linalg.solve(spread, off[..., None])[..., 0])
     count = seen.sum(0)
     both = seen.T.astype(float) @ seen
@@ -198,6 +206,7 @@ def _chosen(given, fit, which, keep, free):
     pairs = []
     for i in np.flatnonzero(keep):
         density = bundle.log_inlier(given, fit.path, fit.points[i])
+        density += STAY * (which == i)
         good = np.flatnonzero(free & (density > clutter))
         pairs.append((good, np.full(len(good), i), density[good]))
     m, point, density = (np.concatenate(part) for part in zip(*pairs, strict=True)) if pairs else (
