@@ -81,18 +81,18 @@ def draw_map(result):
         _curve(axes, *true[:, :2].T, TRUE, label="true path")
     reckoning = result.dead_reckoning
     axes.plot(*reckoning[:, :2].T, "--", color=RECKONING, lw=0.7, label="dead reckoning", zorder=1)
-    axes.plot(*result.pose[:, :2].T, color=FILTER, lw=1.0, alpha=0.85, label="filter", zorder=3)
+    axes.plot(*result.pose[:, :2].T, color=FILTER, lw=0.8, alpha=0.7, label="filter", zorder=3)
     if result.refined is not None:
         path = result.refined.pose
-        axes.plot(*path[:, :2].T, color=REFINED, lw=1.0, alpha=0.85, label="refined", zorder=3.5)
+        axes.plot(*path[:, :2].T, color=REFINED, lw=0.9, label="refined", zorder=3.5)
     axes.plot(*log.start_pose[:2], "D", ms=6, mec="white", color=FILTER, label="start", zorder=6)
     if log.truth is not None and log.truth.landmarks is not None:
         axes.plot(
             *log.truth.landmarks.T, "o", ms=9, mfc="none", mec=TRUE, label="true landmark", zorder=4
         )
     for world, sign, colour, label in (
-        (result.landmarks, "+", LANDMARK, "landmark"),
-        (result.landmarks_refined, "x", REFINED, "refined landmark"),
+        (result.landmarks, "+", LANDMARK, "filter's"),
+        (result.landmarks_refined, "x", REFINED, "refined"),
     ):
         if world is not None:
             _draw_landmarks(axes, world, sign, colour, label)
@@ -107,17 +107,19 @@ def draw_map(result):
     return figure
 
 
-def _draw_landmarks(axes, landmarks, sign, colour, label):
+def _draw_landmarks(axes, landmarks, sign, colour, whose):
     """Draw a map: signs and ellipses, of what can be drawn."""
     mean, cov = np.reshape(landmarks.mean, (-1, 2)), np.reshape(landmarks.cov, (-1, 3))
     drawable = np.isfinite(mean).all(1) & np.isfinite(cov).all(1)
     mean, cov = mean[drawable], cov[drawable]
     if len(mean) == 0:
         return
-    (signs,) = axes.plot(*mean.T, sign, ms=7, mew=1.6, color=colour, label=label, zorder=5)
-    signs.set_path_effects([withStroke(linewidth=3.2, foreground="white")])
+    (signs,) = axes.plot(
+        *mean.T, sign, ms=6, mew=1.4, color=colour, label=f"{whose} landmark", zorder=5
+    )
+    signs.set_path_effects([withStroke(linewidth=2.8, foreground="white")])
     outlines = LineCollection(
-        ellipses(mean, cov), colors=colour, linewidths=0.9, zorder=5, label=r"its 3$\sigma$"
+        ellipses(mean, cov), colors=colour, linewidths=0.9, zorder=5, label=rf"{whose} 3$\sigma$"
     )
     axes.add_collection(outlines, autolim=False)
 
@@ -199,10 +201,10 @@ def _count(result, low, high):
     return f"{len(mean)} landmarks" + (f" ({', '.join(about)})" if about else "")
 
 
-LINES = {  # colour and label of every path
-    "filtered": (FILTER, "filter"),
-    "ancestral": (ANCESTRAL, "ancestral"),
-    "refined": (REFINED, "refined"),
+LINES = {  # colour, width and label of every path, from the lowest to the uppermost
+    "ancestral": (ANCESTRAL, 2.4, "ancestral"),  # wider: mostly the filter's line covers it
+    "filtered": (FILTER, 1.0, "filter"),
+    "refined": (REFINED, 1.0, "refined"),
 }
 
 
@@ -215,20 +217,21 @@ def draw_error(result):
     _draw_band(position, heading, seconds, result.cov, FILTER, r"filter's own 3$\sigma$")
     if result.refined is not None:
         cov = result.refined.cov
-        _draw_band(position, heading, seconds, cov, REFINED, r"refined's own 3$\sigma$")
+        _draw_band(position, heading, seconds, cov, REFINED, r"refined path's own 3$\sigma$")
     reference = true if known else result.pose
-    for name, path in paths(result).items():
-        away = np.hypot(*(path - reference)[:, :2].T)
-        if name == "dead_reckoning":
-            _curve(drift, seconds, away, RECKONING, "--", "dead reckoning")
-            continue
-        colour, label = LINES[name]
+    found = paths(result)
+    for name in [name for name in LINES if name in found]:
+        path, (colour, width, label) = found[name], LINES[name]
         turned = np.degrees(wrap(path - true)[:, 2])
         turned[1:][np.abs(np.diff(turned)) > 180] = np.nan  # no line across the whole panel
-        _curve(position, seconds, np.hypot(*(path - true)[:, :2].T), colour, label=label)
-        _curve(heading, seconds, turned, colour)
+        error = np.hypot(*(path - true)[:, :2].T)
+        _curve(position, seconds, error, colour, label=label, width=width)
+        _curve(heading, seconds, turned, colour, width=width)
         if known or name != "filtered":
-            _curve(drift, seconds, away, colour)
+            away = np.hypot(*(path - reference)[:, :2].T)
+            _curve(drift, seconds, away, colour, width=width)
+    away = np.hypot(*(result.dead_reckoning - reference)[:, :2].T)
+    _curve(drift, seconds, away, RECKONING, "--", "dead reckoning")
     about = "errors, not aligned; gaps: no truth" if known else "the log has no truth"
     position.set(title=f"{result.log.name}: {about}", ylabel="position error [m]", ylim=(0, None))
     heading.set(ylabel="heading error [°]")
@@ -253,25 +256,27 @@ def _draw_band(position, heading, seconds, cov, colour, label):
     fill.set_label(label)
 
 
-def _curve(axes, x, y, colour, style="-", label=None):
+def _curve(axes, x, y, colour, style="-", label=None, width=1.1):
     """A line; values that have no finite neighbour, which a line can't show, are dots."""
     known = np.pad(np.isfinite(y), 1)
     alone = known[1:-1] & ~known[:-2] & ~known[2:]
-    axes.plot(x, y, style, color=colour, lw=1.1, label=label)
+    axes.plot(x, y, style, color=colour, lw=width, label=label)
     axes.plot(x[alone], y[alone], ".", color=colour, ms=4)
 
 
 def draw_particles(result):
     """Figure over time: effective sample size and resampling, landmarks made and freed, clutter."""
-    past = result.ancestral
+    past, seconds = result.ancestral, _seconds(result)
     figure = Figure(figsize=(9.5, 7.0 if past is None else 8.6), layout="constrained")
     heights = (1.5, 1, 1) if past is None else (1.5, 1, 1, 1)
-    panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
-    sample, landmarks, clutter = panels[[0, -2, -1]]
-    seconds = _seconds(result)
+    panels = figure.subplots(len(heights), 1, height_ratios=heights)
+    sample, landmarks, clutter = panels[:3]
+    for axes in (sample, landmarks):
+        axes.sharex(clutter)
+        axes.tick_params(labelbottom=False)
     _draw_sample_size(sample, result, seconds)
     if past is not None:
-        _draw_ancestors(panels[1], past.distinct, seconds, result.config.particles)
+        _draw_ancestors(panels[3], past.distinct, seconds, result.config.particles)
     for name, label, colour in (
         ("new", "created, best particle", FILTER),
         ("forgotten", "forgotten, mean of particles", LANDMARK),
@@ -294,17 +299,21 @@ def draw_particles(result):
 
 
 def _draw_ancestors(axes, distinct, seconds, particles):
-    """How many ancestors the particles of the end have at each time; where it is one, in grey."""
-    axes.step(
-        seconds, distinct, color=ANCESTRAL, lw=1.4, where="post", label="ancestors of the end"
-    )
+    """How many ancestors the particles of the end have, by the time before it: they soon merge."""
+    before = (seconds[-1:] - seconds)[:-1]  # the end itself has no place on a logarithmic axis
+    distinct = distinct[: len(before)]
+    axes.step(before, distinct, color=ANCESTRAL, lw=1.6, where="mid", label="distinct ancestors")
     lone = np.flatnonzero(distinct == 1)
     if lone.size:
-        label = "the past hangs on one"
-        axes.axvspan(0, seconds[lone[-1]], color=PLAN, alpha=0.25, lw=0, label=label)
-    axes.set(yscale="log", ylim=(0.8, particles * 1.3), ylabel="ancestors")
-    axes.yaxis.set_major_formatter("{x:,.0f}")
-    axes.yaxis.set_minor_formatter(NullFormatter())
+        span = before[lone[-1]], before[0]
+        axes.axvspan(*span, color=PLAN, alpha=0.25, lw=0, label="all particles share one past")
+    axes.set(xscale="log", yscale="log", ylim=(0.8, particles * 1.3), ylabel="ancestors")
+    axes.set_xlabel("time before the end [s]")
+    if before.size:
+        axes.set_xlim(before[0], before[-1] * 0.9)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:,g}")
+        axis.set_minor_formatter(NullFormatter())
 
 
 def _draw_sample_size(axes, result, seconds):

@@ -118,11 +118,11 @@ class Result:
         if not len(self.time) or self.ancestral.distinct[0] > 1:
             return []
         last = np.flatnonzero(self.ancestral.distinct == 1)[-1]
-        seconds = (self.time[last] - self.time[0]) / 1e9
+        seconds = (self.time[-1] - self.time[last]) / 1e9
         share = (last + 1) / len(self.time)
         return [
-            f"up to {seconds:.1f} s, {share:.0%} of the path, all particles descend from one: "
-            "there the ancestral covariance says nothing"
+            f"all particles share one past up to {seconds:.1f} s before the end ({share:.1%} of "
+            "the path): the ancestral covariance says nothing about it"
         ]
 
     def save(self, directory, overwrite=False, log_source=None):

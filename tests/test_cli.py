@@ -66,7 +66,7 @@ def test_from_csv_files_to_errors_and_figures(at, call):
     code, out, err = call(*run)
     assert code == 0
     # Advice is no warning: the exit code does not tell of it.
-    assert err.startswith("note: up to ") and err.count("\n") == 1
+    assert err.startswith("note: all particles share one past ") and err.count("\n") == 1
     for label in ("path, filter", "path, ancestral", "path, refined", "landmarks, refined"):
         assert label in out
     assert "; refined in " in out.splitlines()[-2]

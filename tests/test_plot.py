@@ -71,7 +71,7 @@ def texts(figure):
 
 def test_map_says_what_it_shows():
     legend, title = texts(plot.draw_map(make_result()))
-    for entry in ("true path", "filter", "dead reckoning", "landmark", "true landmark"):
+    for entry in ("true path", "filter", "dead reckoning", "filter's landmark", "true landmark"):
         assert entry in legend
     for words in (
         "circle",
@@ -82,7 +82,7 @@ def test_map_says_what_it_shows():
         assert words in title
     assert "5 landmarks (1 outside the picture)" in title
     legend, title = texts(plot.draw_map(make_refined()))
-    assert {"refined", "refined landmark"} < set(legend)
+    assert {"refined", "refined landmark", r"refined 3$\sigma$"} < set(legend)
     assert "path error 0.10 m filtered, 0.05 m refined (RMSE, not aligned)" in title
     assert "5 landmarks (4 refined, 1 outside the picture)" in title
     legend, title = texts(plot.draw_map(make_result(truth=False)))
@@ -119,7 +119,7 @@ def test_every_path_has_its_error_over_time():
     figure = plot.draw_error(make_refined())
     told = texts(figure)[0]
     assert {"filter", "ancestral", "refined", "dead reckoning"} < set(told)
-    assert {r"filter's own 3$\sigma$", r"refined's own 3$\sigma$"} < set(told)
+    assert {r"filter's own 3$\sigma$", r"refined path's own 3$\sigma$"} < set(told)
     position = figure.axes[0]
     curves = {line.get_label(): line.get_ydata() for line in position.lines}
     for label, off in (("filter", 0.1), ("ancestral", 0.08), ("refined", 0.05)):
@@ -131,8 +131,11 @@ def test_every_path_has_its_error_over_time():
 def test_the_past_that_hangs_on_one_is_marked():
     axes = plot.draw_particles(make_refined()).axes
     assert len(axes) == len(plot.draw_particles(make_result()).axes) + 1
-    np.testing.assert_array_equal(axes[1].lines[0].get_ydata(), np.arange(40) // 10 + 1)
-    assert axes[1].patches[0].get_width() == pytest.approx(1.8)  # s
+    curve = axes[-1].lines[0]
+    np.testing.assert_allclose(curve.get_xdata(), 0.2 * np.arange(39, 0, -1))  # before the end
+    np.testing.assert_array_equal(curve.get_ydata(), np.arange(39) // 10 + 1)
+    marked = axes[-1].patches[0]
+    np.testing.assert_allclose([marked.get_x(), marked.get_width()], [6.0, 1.8])
 
 
 def shown_readings(log):

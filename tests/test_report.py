@@ -70,8 +70,8 @@ def test_summary_of_what_looks_back():
     assert not told.keys() - {"n_landmarks"} & plain.keys()
     assert summary["warnings"] == plain["warnings"]
     assert summary["advice"] == [
-        "up to 1.8 s, 25% of the path, all particles descend from one: "
-        "there the ancestral covariance says nothing"
+        "all particles share one past up to 6.0 s before the end (25.0% of the path): "
+        "the ancestral covariance says nothing about it"
     ]
 
 
