@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize
 
 from jaxslam import default_params, load_log, load_params, sensors
 from jaxslam.evaluate import align_se2, ate, between, map_error, truth_at, with_truth, wrap
@@ -288,34 +288,39 @@ def gained(log, file=None, sensor="bearing"):
     return load_params(file, params) if file is not None and file.exists() else params
 
 
-def find_gain(log):
-    """`gain_rot` of a log without its truth: where path, map and gain together are most probable.
+def find_gains(log):
+    """`gain_rot` and `bias_drift` of a log without its truth: where path, map and they together
+    are most probable.
 
-    The search starts each solution at the one before; the first starts at the true path.
+    Each solution starts at the one before; the first at the true path, for speed alone.
     `gain_tran` can't be found from bearings: it scales map and path alike.
     """
     params, last = default_params("bearing", log), [None]
 
-    def cost(gain):
-        found = solve(log, params._replace(gain_rot=gain), last[0], rounds=6)
+    def cost(values):
+        gain, bias = values
+        found = solve(log, params._replace(gain_rot=gain, bias_drift=bias), last[0], rounds=6)
         last[0] = found.pose
         return found.cost
 
-    best = minimize_scalar(cost, bounds=(0.75, 1.1), method="bounded", options={"xatol": 2e-3})
-    return float(best.x)
+    simplex = [(0.9, 0.0), (1.0, 0.0), (0.9, -0.05)]
+    options = {"initial_simplex": simplex, "xatol": 5e-3, "fatol": 0.1, "maxfev": 60}
+    found = minimize(cost, simplex[0], method="Nelder-Mead", options=options)
+    return found.x.tolist()
 
 
 def write_gains():
-    """A parameter file with the gain of each robot of MRCLAM's dataset 6."""
+    """A parameter file with the gains of each robot of MRCLAM's dataset 6."""
     PARAMS.mkdir(exist_ok=True)
     for robot in range(1, 6):
         log, file = mrclam(robot)
-        gain = round(find_gain(log), 3)
+        gain, bias = find_gains(log)
         file.write_text(
             f"# MRCLAM dataset 6, robot {robot}: from its log without truth, batch.py --gains\n"
-            f"gain_rot = {gain}  # true / measured\n"
+            f"gain_rot = {gain:.3f}  # true / measured\n"
+            f"bias_drift = {bias:.3f}  # rad/m\n"
         )
-        print(file.name, gain, flush=True)
+        print(file.name, f"{gain:.3f} {bias:.3f}", flush=True)
 
 
 def variants(params):
