@@ -11,6 +11,7 @@ import zipfile
 
 import numpy as np
 import pytest
+from small_run import make_refined
 
 from jaxslam import cli, compare, console, report, runner, simulate, variants
 from jaxslam.log import load_log, save_log
@@ -65,16 +66,14 @@ def test_from_csv_files_to_errors_and_figures(at, call):
     run = "run", "robot.npz", "--association", "known", "--particles", "50", "--out", "result"
     code, out, err = call(*run)
     assert code == 0
-    # Advice is no warning: the exit code does not tell of it.
-    assert err.startswith("note: all particles share one past ") and err.count("\n") == 1
-    for label in ("path, filter", "path, ancestral", "path, refined", "landmarks, refined"):
+    for label in ("path, filter", "path, ancestral", "path, refined", "dead reckoning"):
         assert label in out
     assert "; refined in " in out.splitlines()[-2]
     assert "result" in out.splitlines()[-1]
     summary = json.loads((at / "result" / "summary.json").read_text())
     assert (summary["n_particles"], summary["n_landmarks"]) == (50, 3)
-    assert (summary["n_landmarks_refined"], summary["least_ancestors"]) == (3, 1)
-    assert summary["advice"] == [err.removeprefix("note: ").rstrip()]
+    assert summary["n_landmarks_refined"] == 3
+    assert [f"note: {line}" for line in summary["advice"]] == err.splitlines()
     assert len((at / "result" / "landmarks_refined.csv").read_text().splitlines()) == 4
     errors = json.loads(call("evaluate", "result", "--json")[1])
     assert errors["truth_frames"] == 16
@@ -214,6 +213,21 @@ def test_lost_data_are_warnings(at, call, short):
     code, _, err = call("convert", "odometry.csv", "seen.csv", "robot.npz")
     assert code == 1
     assert err.startswith("warning: 1 rows skipped: ")
+
+
+def test_advice_is_a_note_and_no_warning(log, call, monkeypatch):
+    asked = []
+
+    def filtered(*given, refine):
+        asked.append(refine)
+        return dataclasses.replace(make_refined(), dropped={})
+
+    monkeypatch.setattr(runner, "run", filtered)
+    monkeypatch.setattr(runner, "refined", lambda result, progress: result)
+    code, out, err = call("run", log, "--out", "result")
+    assert (code, asked) == (0, [False])  # it refines by itself, with a progress bar of its own
+    assert err.startswith("note: all particles share one past ") and err.count("\n") == 1
+    assert out.splitlines()[-2].endswith("; refined in 0.8 s")
 
 
 def test_check_tells_by_its_exit_code(at, call, short):

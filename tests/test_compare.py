@@ -84,6 +84,7 @@ def test_comparison_in_both_precisions():
     assert row.double.landmarks <= 1e-12 < row.single.landmarks <= 1e-3
     assert row.double.overflow > 0  # three slots were too few, and both lost the same landmarks
     assert 0 < row.ate_baseline < 1
+    assert row.double.map_baseline.mean.shape == (0, 2)  # none confirmed so soon
     assert row.ate_filter == pytest.approx(row.ate_baseline, abs=1e-5)
     assert min(row.double.seconds_baseline, row.single.seconds_filter) > 0
     assert calls[0] == (0, 10)
@@ -100,38 +101,54 @@ def test_the_baseline_refuses_what_it_has_not():
             compare.agreement(log, replace(config, **other))
 
 
-@pytest.fixture(scope="module")
-def side_by_side():
+def test_the_baselines_map_is_what_its_best_particle_is_sure_of():
+    def mark(x, y, log_odds=9.0, variance=0.01):
+        return SimpleNamespace(
+            mean=np.array([x, y]), cov=np.eye(2) * variance, log_odds=log_odds, anchor=np.ones(2)
+        )
+
+    marks = [mark(0.0, 0.5), None, mark(7.0, 7.0, 1.0), mark(0.0, 0.5, variance=0.04)]
+    particles = [SimpleNamespace(landmarks=[]), SimpleNamespace(landmarks=marks)]
+    # The best one, 3, lives on as its child 1.
+    reference = SimpleNamespace(ancestors=[[2, 3, 3]], best=[3], particles=particles)
+    reference.ancestors = np.array(reference.ancestors)
+    params = SimpleNamespace(existence_confirm=5.0)
+
+    def found(sensor, **rules):
+        config = Config(sensor=sensor, **rules)
+        given = reference, params, config, np.array([40, 41, 42]), np.array([10.0, 20, 0])
+        return [column.tolist() for column in compare._baseline_map(*given)]
+
+    assert found("position") == [[[10.0, 20.5], [10.0, 20.5]], [40, -1]]
+    assert len(found("position", forgetting=False)[0]) == 3
+    assert found("bearing") == [[[13.0, 21.0]], [40]]  # 2 m from its anchor; the last: no depth
+
+
+def test_variants_stand_side_by_side():
     log = simulate.planar("field", 5, landmarks=15, length_m=12.0, rate_hz=2.0)
     config = Config(particles=30, measurements=8, landmarks=24)
-    few = replace(config, particles=5)
-    baselines = [compare.compare(log, few, steps=40, every=1)]
-    return log, baselines, variants.variants(log, config, None, 0, 40, 1, baselines)
-
-
-def test_variants_stand_side_by_side(side_by_side):
-    log, _, rows = side_by_side
+    pose, marks = log.truth.pose[:40] + [0.25, 0, 0], log.truth.landmarks[:9]
+    world = compare.PointMap(marks + [0.25, 0.1], np.full(9, -1))
+    zeros = [0.0] * 4
+    slow = compare.Agreement(40, 5, 40, *zeros[:3], 1, *zeros, pose, pose, 8.0, 0.1, 0.3, world)
+    baselines = [compare.Comparison(slow, slow, 0.25, 0.25)]
+    rows = variants.variants(log, config, None, 0, 40, 1, baselines)
     names = ["baseline, NumPy", "Config.paper()", "FastSLAM 1.0", "informed", "refined"]
     assert [row.name for row in rows] == names
     assert [row.particles for row in rows] == [5, 30, 30, 30, 30]
-    for row in rows:
+    found = (0, 0.25, 0.1, 0.2)  # m and s
+    assert rows[0][2:5] + rows[0][6:] == pytest.approx(found, abs=1e-6)
+    assert rows[0].counts == (9, 6, 0)
+    for row in rows[1:]:
         assert 0 < row.aligned < row.unaligned < 0.5
         assert 0 < row.landmarks < 0.5
         matched, missed, _ = row.counts
         assert matched > 5 and matched + missed == len(log.truth.landmarks)
-    assert rows[-1].aligned < rows[2].aligned
+    assert rows[-1].unaligned < rows[2].unaligned
+    assert rows[-1].seconds > rows[-2].seconds  # with what was spent before
     lines = variants.table(rows).splitlines()
     assert [line[:16].strip() for line in lines[1:]] == names
-    assert f"{rows[0].unaligned:.3f} m" in lines[1]
-
-
-def test_the_baselines_map_is_that_of_its_best_particle(side_by_side):
-    log, (row,), _ = side_by_side
-    world = row.double.map_baseline
-    assert world.mean.shape == (len(world.identity), 2)
-    assert (world.identity == -1).all()  # identities were hidden
-    nearest = np.hypot(*(world.mean[:, None] - log.truth.landmarks).T).min(0)
-    assert len(nearest) > 5 and np.median(nearest) < 0.3
+    assert "0.250 m" in lines[1] and "9/6/0" in lines[1] and "200 ms" in lines[1]
 
 
 def test_variants_without_truth_have_times_only():
