@@ -9,9 +9,16 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxslam import geometry, sensors
 from jaxslam.geometry import wrap
+
+
+NODES, BETWEEN = 5, 0.75  # normals a bearing landmark is split into; share of variance between
+CIRCLE = 3.0  # rad^2: a bearing's prediction is no wider than the circle
+_node, _weight = np.polynomial.hermite_e.hermegauss(NODES)
+SPLIT = BETWEEN**0.5 * _node, np.log(_weight / _weight.sum())
 
 
 class Landmarks(NamedTuple):
@@ -59,9 +66,11 @@ def scorer(sensor, seen, landmarks, inlier):
     spread = [geometry.transpose_times(factor, row) for row in seen.rows]
     s00 = spread[0][0] ** 2 + spread[0][1] ** 2
     if sensor == "bearing":
-        s00 = jnp.where(occupied, s00 + seen.noise[0], 1.0)
-        constant = -0.5 * (jnp.log(s00) + sensors.LOG_2PI)
-        return Scorer(seen.value, (-0.5 / s00,), jnp.where(occupied, inlier + constant, -jnp.inf))
+        shift, extra = _bend(spread[0], geometry.transpose_times(factor, seen.stretch))
+        s00 = jnp.minimum(s00 + extra, CIRCLE) + seen.noise[0]
+        s00 = jnp.where(occupied, s00, 1.0)
+        constant = jnp.where(occupied, inlier - 0.5 * (jnp.log(s00) + sensors.LOG_2PI), -jnp.inf)
+        return Scorer((seen.value[0] + shift,), (-0.5 / s00,), constant)
     s01 = spread[0][0] * spread[1][0] + spread[0][1] * spread[1][1]
     s11 = spread[1][0] ** 2 + spread[1][1] ** 2
     if sensor == "position":
@@ -98,11 +107,10 @@ def update(sensor, sensor_pose, mean, factor, anchor, value, cov, params):
     A 2-D measurement is two whitened scalars, both linearised at the mean before the update, so
     that the product of their densities is the joint one.
     """
-    seen = sensors.observe(sensor, sensor_pose, mean, anchor, params)
     if sensor == "bearing":
-        innovations = (wrap(value[0] - seen.value[0]),)
-        rows, variances = seen.rows, seen.noise
-    elif sensor == "position":
+        return _update_bearing(sensor_pose, mean, factor, anchor, value[0], params)
+    seen = sensors.observe(sensor, sensor_pose, mean, anchor, params)
+    if sensor == "position":
         innovations, rows, variances = _whiten(seen, value, cov, params)
     else:
         innovations = (value[0] - seen.value[0], wrap(value[1] - seen.value[1]))
@@ -113,9 +121,61 @@ def update(sensor, sensor_pose, mean, factor, anchor, value, cov, params):
         rest = innovation - moved
         mean, factor, s = geometry.scalar_update(mean, factor, row, rest, variance)
         log_density -= 0.5 * (rest * rest / s + jnp.log(s) + sensors.LOG_2PI)
-    if sensor == "bearing":
-        mean = (mean[0], jnp.maximum(mean[1], sensors.LEAST_INVERSE_DEPTH))
     return mean, factor, log_density
+
+
+def _bend(along, stretch):
+    """Mean and variance that the bearing's second derivatives add to its prediction.
+
+    `along`, `stretch`: the rows of `sensors.Seen` times the landmark's factor, u and v; the Hessian
+    is then -(u v' + v u').
+    """
+    (u1, u2), (v1, v2) = along, stretch
+    both = u1 * v1 + u2 * v2
+    return -both, (u1 * u1 + u2 * u2) * (v1 * v1 + v2 * v2) + both * both
+
+
+def _update_bearing(sensor_pose, mean, factor, anchor, value, params):
+    """A bearing's update, where depth may be anything: `NODES` narrower normals along inverse depth,
+    a second-order EKF for each, merged into one of the mixture's mean and covariance.
+
+    One EKF is over-confident where the robot drives towards a landmark and past where it took it to
+    be; this stays with the exact posterior (experiments/inverse_depth.py). Gauss-Hermite nodes with
+    `BETWEEN` of the variance and normals with the rest have the moments of the whole (Gaussian sum:
+    Alspach and Sorenson 1972; splitting along one direction: Huber 2011).
+    """
+    shape = (-1, *([1] * jnp.ndim(mean[1] + sensor_pose[0])))
+    node, log_weight = (jnp.reshape(jnp.array(v, jnp.result_type(factor[0])), shape) for v in SPLIT)
+    l11, l21, l22 = factor
+    variance = l21 * l21 + l22 * l22
+    per_sd = 1 / jnp.sqrt(variance)
+    left = 1 / jnp.sqrt(1 - BETWEEN * l21 * l21 * per_sd * per_sd)
+    narrow = (l11 / left, (1 - BETWEEN) * l21 * left, (1 - BETWEEN) ** 0.5 * l22 * left)
+    part = (mean[0] + l11 * l21 * per_sd * node, mean[1] + variance * per_sd * node)
+    seen = sensors.observe("bearing", sensor_pose, part, anchor, params)
+    (row,), (noise,) = seen.rows, seen.noise
+    spread = geometry.transpose_times(narrow, row)
+    shift, extra = _bend(spread, geometry.transpose_times(narrow, seen.stretch))
+    rest = wrap(value - seen.value[0] - shift)
+    part, narrow, s = geometry.scalar_update(part, narrow, row, rest, noise + extra)
+    s = jnp.minimum(s - noise, CIRCLE) + noise
+    share = log_weight - 0.5 * (rest * rest / s + jnp.log(s) + sensors.LOG_2PI)
+    log_density = jax.nn.logsumexp(share, 0)
+    mean, factor = _merge(part, narrow, jnp.exp(share - log_density))
+    return (mean[0], jnp.maximum(mean[1], sensors.LEAST_INVERSE_DEPTH)), factor, log_density
+
+
+def _merge(mean, factor, weight):
+    """Mean and factor of a mixture of normals, along the first axis; sums of squares throughout."""
+    l11, l21, l22 = factor
+    m0, m1 = ((weight * m).sum(0) for m in mean)
+    d0, d1 = mean[0] - m0, mean[1] - m1
+    top = jnp.sqrt((weight * (l11 * l11 + d0 * d0)).sum(0))
+    side = (weight * (l11 * l21 + d0 * d1)).sum(0) / top
+    slope = side / top
+    off, away = l21 - slope * l11, d1 - slope * d0
+    low = jnp.sqrt((weight * (off * off + l22 * l22 + away * away)).sum(0))
+    return (m0, m1), (top, side, low)
 
 
 def _whiten(seen, value, cov, params):

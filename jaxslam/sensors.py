@@ -41,13 +41,18 @@ class Measurements(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """Prediction of one landmark: its measurement, rows of the Jacobian, noise, where it is."""
+    """Prediction of one landmark: its measurement, rows of the Jacobian, noise, where it is.
+
+    `stretch`: for `bearing`, the derivative of log range by the landmark, at a held inverse depth.
+    With the bearing's row h, the bearing's Hessian is -(stretch h' + h stretch').
+    """
 
     value: tuple
     rows: tuple
     noise: tuple
     range: jax.Array
     bearing: jax.Array
+    stretch: tuple = ()
 
 
 def rescaled(measurements, params):
@@ -99,9 +104,10 @@ def observe(sensor, sensor_pose, mean, anchor, params):
         bearing = wrap(direction(dy, dx) - heading)
         scale = 1 / (q * q)
         row = ((dy * s + dx * c) * scale, (dx * ay - dy * ax) * scale)
+        stretch = ((dy * c - dx * s) * scale, (dx * ax + dy * ay) * scale)
         r = q / jnp.maximum(depth, LEAST_INVERSE_DEPTH)
         variance = params.sigma_bearing**2 + (params.growth * depth / q) ** 2
-        return Seen((bearing,), (row,), (variance,), r, bearing)
+        return Seen((bearing,), (row,), (variance,), r, bearing, stretch)
     dx, dy = mean[0] - sx, mean[1] - sy
     r = norm(dx, dy)
     bearing = wrap(direction(dy, dx) - heading)
