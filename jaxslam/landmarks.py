@@ -16,7 +16,6 @@ from jaxslam.geometry import wrap
 
 
 NODES, BETWEEN = 5, 0.75  # normals a bearing landmark is split into; share of variance between
-CIRCLE = 3.0  # rad^2: a bearing's prediction is no wider than the circle
 _node, _weight = np.polynomial.hermite_e.hermegauss(NODES)
 SPLIT = BETWEEN**0.5 * _node, np.log(_weight / _weight.sum())
 
@@ -67,8 +66,7 @@ def scorer(sensor, seen, landmarks, inlier):
     s00 = spread[0][0] ** 2 + spread[0][1] ** 2
     if sensor == "bearing":
         shift, extra = _bend(spread[0], geometry.transpose_times(factor, seen.stretch))
-        s00 = jnp.minimum(s00 + extra, CIRCLE) + seen.noise[0]
-        s00 = jnp.where(occupied, s00, 1.0)
+        s00 = jnp.where(occupied, s00 + extra + seen.noise[0], 1.0)
         constant = jnp.where(occupied, inlier - 0.5 * (jnp.log(s00) + sensors.LOG_2PI), -jnp.inf)
         return Scorer((seen.value[0] + shift,), (-0.5 / s00,), constant)
     s01 = spread[0][0] * spread[1][0] + spread[0][1] * spread[1][1]
@@ -151,14 +149,17 @@ def _update_bearing(sensor_pose, mean, factor, anchor, value, params):
     per_sd = 1 / jnp.sqrt(variance)
     left = 1 / jnp.sqrt(1 - BETWEEN * l21 * l21 * per_sd * per_sd)
     narrow = (l11 / left, (1 - BETWEEN) * l21 * left, (1 - BETWEEN) ** 0.5 * l22 * left)
-    part = (mean[0] + l11 * l21 * per_sd * node, mean[1] + variance * per_sd * node)
-    seen = sensors.observe("bearing", sensor_pose, part, anchor, params)
+    turn, nearer = l11 * l21 * per_sd * node, variance * per_sd * node
+    # Linear in direction: cosines of every part would be most of the work.
+    (dx, dy), (tx, ty), (ax, ay) = sensors.ray(sensor_pose, mean, anchor)
+    point = (dx + tx * turn + ax * nearer, dy + ty * turn + ay * nearer)
+    part = (mean[0] + turn, mean[1] + nearer)
+    seen = sensors.along_ray(point, (tx, ty), (ax, ay), part[1], sensor_pose[2], params)
     (row,), (noise,) = seen.rows, seen.noise
     spread = geometry.transpose_times(narrow, row)
     shift, extra = _bend(spread, geometry.transpose_times(narrow, seen.stretch))
     rest = wrap(value - seen.value[0] - shift)
     part, narrow, s = geometry.scalar_update(part, narrow, row, rest, noise + extra)
-    s = jnp.minimum(s - noise, CIRCLE) + noise
     share = log_weight - 0.5 * (rest * rest / s + jnp.log(s) + sensors.LOG_2PI)
     log_density = jax.nn.logsumexp(share, 0)
     mean, factor = _merge(part, narrow, jnp.exp(share - log_density))

@@ -15,6 +15,7 @@ STILL |= {"lever": 0.5, "lever_var": 1 / 12}
 MOTION = {"err_tran": 0, "err_rot": 0, "err_drift": 0, "floor_tran": 0, "floor_rot": 0}
 MOTION |= {"gain_tran": 1, "gain_rot": 1, "bias_drift": 0}
 SENSING = {"sigma_range": 0.1, "sigma_bearing": 0.05, "growth": 0.03, "position_scale": 1}
+SENSING |= {"correlation": 0.0}
 SENSING |= {"mount_x": 0.2, "mount_y": -0.1, "mount_yaw": 0.3, "outlier": 0.02, "density_new": 0.1}
 SENSING |= {"detection": 0.9, "view_min": -2.0, "view_max": 2.0, "view_range": 10.0}
 SENSING |= {"inv_depth_mean": 0.3, "inv_depth_sd": 0.2}
