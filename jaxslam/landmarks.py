@@ -142,27 +142,32 @@ def _update_bearing(sensor_pose, mean, factor, anchor, value, params):
     `BETWEEN` of the variance and normals with the rest have the moments of the whole (Gaussian sum:
     Alspach and Sorenson 1972; splitting along one direction: Huber 2011).
     """
-    shape = (-1, *([1] * jnp.ndim(mean[1] + sensor_pose[0])))
-    node, log_weight = (jnp.reshape(jnp.array(v, jnp.result_type(factor[0])), shape) for v in SPLIT)
     l11, l21, l22 = factor
     variance = l21 * l21 + l22 * l22
     per_sd = 1 / jnp.sqrt(variance)
     left = 1 / jnp.sqrt(1 - BETWEEN * l21 * l21 * per_sd * per_sd)
     narrow = (l11 / left, (1 - BETWEEN) * l21 * left, (1 - BETWEEN) ** 0.5 * l22 * left)
-    turn, nearer = l11 * l21 * per_sd * node, variance * per_sd * node
+    step = (l11 * l21 * per_sd, variance * per_sd)
     # Linear in direction: cosines of every part would be most of the work.
     (dx, dy), (tx, ty), (ax, ay) = sensors.ray(sensor_pose, mean, anchor)
-    point = (dx + tx * turn + ax * nearer, dy + ty * turn + ay * nearer)
-    part = (mean[0] + turn, mean[1] + nearer)
-    seen = sensors.along_ray(point, (tx, ty), (ax, ay), part[1], sensor_pose[2], params)
-    (row,), (noise,) = seen.rows, seen.noise
-    spread = geometry.transpose_times(narrow, row)
-    shift, extra = _bend(spread, geometry.transpose_times(narrow, seen.stretch))
-    rest = wrap(value - seen.value[0] - shift)
-    part, narrow, s = geometry.scalar_update(part, narrow, row, rest, noise + extra)
-    share = log_weight - 0.5 * (rest * rest / s + jnp.log(s) + sensors.LOG_2PI)
+
+    def one(split):
+        turn, nearer = split[0] * step[0], split[0] * step[1]
+        point = (dx + tx * turn + ax * nearer, dy + ty * turn + ay * nearer)
+        part = (mean[0] + turn, mean[1] + nearer)
+        seen = sensors.along_ray(point, (tx, ty), (ax, ay), part[1], sensor_pose[2], params)
+        (row,), (noise,) = seen.rows, seen.noise
+        spread = geometry.transpose_times(narrow, row)
+        shift, extra = _bend(spread, geometry.transpose_times(narrow, seen.stretch))
+        rest = wrap(value - seen.value[0] - shift)
+        part, cov, s = geometry.scalar_update(part, narrow, row, rest, noise + extra)
+        return part, cov, split[1] - 0.5 * (rest * rest / s + jnp.log(s) + sensors.LOG_2PI)
+
+    # A loop, as what it hands on are arrays: else XLA works all out again for each of the sums.
+    split = jax.tree.map(lambda v: jnp.array(v, jnp.result_type(l11)), SPLIT)
+    part, cov, share = jax.lax.map(one, split)
     log_density = jax.nn.logsumexp(share, 0)
-    mean, factor = _merge(part, narrow, jnp.exp(share - log_density))
+    mean, factor = _merge(part, cov, jnp.exp(share - log_density))
     return (mean[0], jnp.maximum(mean[1], sensors.LEAST_INVERSE_DEPTH)), factor, log_density
 
 
