@@ -14,7 +14,6 @@ import numpy as np
 from jaxslam import geometry, sensors
 from jaxslam.geometry import wrap
 
-
 NODES, BETWEEN = 5, 0.75  # normals a bearing landmark is split into; share of variance between
 _node, _weight = np.polynomial.hermite_e.hermegauss(NODES)
 SPLIT = BETWEEN**0.5 * _node, np.log(_weight / _weight.sum())
@@ -134,13 +133,13 @@ def _bend(along, stretch):
 
 
 def _update_bearing(sensor_pose, mean, factor, anchor, value, params):
-    """A bearing's update, where depth may be anything: `NODES` narrower normals along inverse depth,
-    a second-order EKF for each, merged into one of the mixture's mean and covariance.
+    """A bearing's update: `NODES` narrower normals along inverse depth, a second-order EKF for each,
+    merged into one normal of the mixture's mean and covariance.
 
     One EKF is over-confident where the robot drives towards a landmark and past where it took it to
-    be; this stays with the exact posterior (experiments/inverse_depth.py). Gauss-Hermite nodes with
+    be; this keeps to the exact posterior (experiments/inverse_depth.py). Gauss-Hermite nodes with
     `BETWEEN` of the variance and normals with the rest have the moments of the whole (Gaussian sum:
-    Alspach and Sorenson 1972; splitting along one direction: Huber 2011).
+    Alspach and Sorenson 1972, doi:10.1109/TAC.1972.1100034).
     """
     l11, l21, l22 = factor
     variance = l21 * l21 + l22 * l22

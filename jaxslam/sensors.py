@@ -43,9 +43,9 @@ class Measurements(NamedTuple):
 class Seen(NamedTuple):
     """Prediction of one landmark: its measurement, rows of the Jacobian, noise, where it is.
 
-    `stretch`: for `bearing`, the derivative by the landmark of the logarithm of `ray`'s length. With
-    the bearing's row h, the bearing's Hessian is -(stretch h' + h stretch'), but for the curvature
-    of the ray's own direction.
+    `stretch`: for `bearing`, the derivative by the landmark of the logarithm of `ray`'s length.
+    With the bearing's row h, the bearing's Hessian is -(stretch h' + h stretch'), but for the
+    curvature of the ray's own direction.
     """
 
     value: tuple
