@@ -133,8 +133,8 @@ def _bend(along, stretch):
 
 
 def _update_bearing(sensor_pose, mean, factor, anchor, value, params):
-    """A bearing's update: `NODES` narrower normals along inverse depth, a second-order EKF for each,
-    merged into one normal of the mixture's mean and covariance.
+    """A bearing's update: `NODES` narrower normals along inverse depth, an EKF of
+    second order for each, merged into one normal of the mixture's mean and covariance.
 
     One EKF is over-confident where the robot drives towards a landmark and past where it took it to
     be; this keeps to the exact posterior (experiments/inverse_depth.py). Gauss-Hermite nodes with
