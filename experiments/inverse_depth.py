@@ -5,8 +5,8 @@ drawn from the filter's prior given the first bearing (direction N(z, sigma^2), 
 N(inv_depth_mean, inv_depth_sd^2) cut off at `LEAST_INVERSE_DEPTH`), so that the exact posterior,
 on a dense grid in float64, is calibrated. Held against it:
 - `ekf`: linearised at the mean.
-- `second`: the bearing's second derivatives shift the prediction and widen it (`second, depth`: that
-  by inverse depth alone).
+- `second`: second derivatives shift the prediction and widen it (`second, depth`: that alone
+  by inverse depth).
 - `iterated`: linearised at the posterior's mode (Gauss-Newton, 5 rounds).
 - `points`: statistical linear regression over 3 Gauss-Hermite points of inverse depth.
 - `split3`, `split5`: the normal as 3 (5) narrower ones along inverse depth, an EKF for each, the

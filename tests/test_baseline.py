@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxslam import baseline
+from jaxslam import baseline, compare, simulate
 from jaxslam import baseline_ekf as ekf
+from jaxslam.config import Config, default_params
 
 SENSORS = ("position", "range_bearing", "bearing")
 STILL = {"dx": 0, "dy": 0, "dtheta": 0, "distance": 0, "turn": 0, "duration": 0}
@@ -291,3 +292,15 @@ def test_small_world(sensor, association):
     if association == "known":
         assert len(points) == 4
         assert result.births.sum(axis=0).tolist() == [4] * n
+
+
+@pytest.mark.parametrize("sensor", ["range_bearing", "bearing"])
+def test_correlated_errors_as_in_the_filter(sensor):
+    log = simulate.planar(length_m=4.0, landmarks=12, seed=3)
+    config = Config(sensor=sensor, particles=4, measurements=6, landmarks=10)
+    params = default_params(sensor, log)._replace(correlation=0.3)
+    found = compare.agreement(log, config, params, seed=1)
+    assert found.same == found.steps
+    assert max(found.pose, found.log_weight, found.landmarks) <= 1e-9
+    white = compare.agreement(log, config, params._replace(correlation=0.0), seed=1)
+    assert np.abs(found.pose_filter - white.pose_filter).max() > 1e-3
