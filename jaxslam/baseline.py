@@ -16,6 +16,7 @@ import numpy as np
 from jaxslam import baseline_ekf as ekf
 
 NEW, CLUTTER, PADDING = -1, -2, -3
+MOST_DULLED = 1e4  # most that a variance grows by for a robot that stands
 
 
 @dataclass(eq=False)
@@ -186,10 +187,26 @@ def forget(particle, before, matched, s, model):
     return freed
 
 
-def correct(particle, frame, columns, index, model):
+def dulled(model, distance):
+    """The model for measurements whose errors live on over `correlation` metres of path.
+
+    An AR(1) process with e-folding path L, read every d: its mean over many reads has the variance
+    of white reads (1 + a) / (1 - a) times as noisy, with a = exp(-d / L).
+    """
+    if model.correlation == 0:
+        return model
+    alike = math.exp(-min(max(distance / model.correlation, 2 / MOST_DULLED), 20.0))
+    ratio = (1 + alike) / (1 - alike)
+    noisy = ("sigma_range", "sigma_bearing", "growth", "position_scale")
+    louder = {name: getattr(model, name) * math.sqrt(ratio) for name in noisy}
+    return SimpleNamespace(**vars(model) | louder)
+
+
+def correct(particle, frame, columns, index, model, dull):
     """All measurements of frame number `index`: associate, weigh, update, create, forget.
 
     Paper, section III-D. Changes the particle in place; returns match [K], slot [K], slots freed.
+    `dull`: the model of what is seen again, from which less is new than in `model`.
     """
     s = ekf.sensor_pose(particle.pose, model)
     before = [i for i, landmark in enumerate(particle.landmarks) if landmark is not None]
@@ -214,7 +231,7 @@ def correct(particle, frame, columns, index, model):
                 particle.landmarks[used[k]] = newborn
         else:
             used[k] = slot
-            log_density = ekf.update(particle.landmarks[slot], measurement, s, model)
+            log_density = ekf.update(particle.landmarks[slot], measurement, s, dull)
             particle.log_weight += np.log(1 - model.outlier) + log_density
     freed = forget(particle, before, choice, s, model) if model.forgetting else 0
     return match, used, freed
@@ -289,7 +306,8 @@ def step(particles, odometry, frame, columns, index, normals, uniform, model):
     outcomes = [([PADDING] * columns, [-1] * columns, 0)] * len(particles)
     row = {"log_evidence": 0.0, "nonfinite": 0, "degenerate": False}
     if frame is not None:
-        outcomes = [correct(p, frame, columns, index, model) for p in particles]
+        dull = dulled(model, odometry.distance)
+        outcomes = [correct(p, frame, columns, index, model, dull) for p in particles]
         row = normalise(particles)
     match, slot, freed = (np.array(part) for part in zip(*outcomes, strict=True))
     row |= {"match": match, "slot": slot, "freed": freed}

@@ -7,13 +7,14 @@ in the world [3], `model` the filter's `Params` and `Config` in one record.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 MIN_RANGE = 1e-6  # m; a landmark under the sensor has no bearing
 MIN_INV_DEPTH = 1e-3  # 1/m; an update must not push a landmark through infinity
+PARTS, APART = 5, 0.75  # narrower normals a bearing landmark is split into; variance between them
 
 
 @dataclass(eq=False)
@@ -33,6 +34,7 @@ class Prediction(NamedTuple):
     jacobian: np.ndarray  # [d, 2] its derivative by the landmark
     bearing: float  # sensor frame
     range: float  # m
+    hessian: np.ndarray | None = None  # [2, 2] of a lone bearing
 
 
 def wrap(angle):
@@ -51,17 +53,24 @@ def sensor_pose(pose, model):
     return np.append(xy, pose[2] + model.mount_yaw)
 
 
-def predict(landmark, s, model):
-    """The measurement expected at s (paper, eq. 3), linearised at the landmark's mean."""
+def predict(landmark, s, model, centre=None):
+    """The measurement expected at s (paper, eq. 3), linearised at the landmark's mean.
+
+    For `bearing` the unit vector of the direction phi is linear about `centre` (None: the mean's).
+    """
     if model.sensor == "bearing":
         phi, rho = landmark.mean
+        centre = phi if centre is None else centre
         shift = landmark.anchor - s[:2]
-        dx, dy = rho * shift + [math.cos(phi), math.sin(phi)]
+        unit, across = rotation(centre).T
+        dx, dy = rho * shift + unit + (phi - centre) * across
         q = math.hypot(dx, dy)
-        by_phi = dy * math.sin(phi) + dx * math.cos(phi)
-        jacobian = np.array([[by_phi, dx * shift[1] - dy * shift[0]]]) / q**2
+        outwards = np.column_stack([across, shift])  # (dx, dy) by (phi, rho)
+        jacobian = np.array([[-dy, dx]]) / q**2 @ outwards
+        curve = np.array([[2 * dx * dy, dy**2 - dx**2], [dy**2 - dx**2, -2 * dx * dy]]) / q**4
         bearing = wrap(math.atan2(dy, dx) - s[2])
-        return Prediction(np.array([bearing]), jacobian, bearing, q / rho)
+        hessian = outwards.T @ curve @ outwards
+        return Prediction(np.array([bearing]), jacobian, bearing, q / rho, hessian)
     dx, dy = landmark.mean - s[:2]
     r = max(math.hypot(dx, dy), MIN_RANGE)
     bearing = wrap(math.atan2(dy, dx) - s[2])
@@ -72,10 +81,13 @@ def predict(landmark, s, model):
 
 
 def noise(r, measurement, model):
-    """R [d, d] at range r. `position` has the paper's 2-D normal error (section III-B.3)."""
+    """R [d, d] at range r, which is negative for an inverse depth beyond infinity.
+
+    `position` has the paper's 2-D normal error (section III-B.3).
+    """
     if model.sensor == "position":
         return model.position_scale**2 * measurement.cov
-    var_bearing = model.sigma_bearing**2 + (model.growth / max(r, MIN_RANGE)) ** 2
+    var_bearing = model.sigma_bearing**2 + (model.growth / max(abs(r), MIN_RANGE)) ** 2
     if model.sensor == "bearing":
         return np.array([[var_bearing]])
     return np.diag([model.sigma_range**2, var_bearing])
@@ -84,11 +96,16 @@ def noise(r, measurement, model):
 def innovation(landmark, measurement, expected, model):
     """Measured minus predicted nu [d], its covariance S = H P H' + R and log N(nu; 0, S).
 
-    The density is p(z | x, M) of the paper's eq. 3 with the landmark integrated out.
+    The density is p(z | x, M) of the paper's eq. 3 with the landmark integrated out. A lone bearing
+    is predicted to second order in the landmark.
     """
     h = expected.jacobian
     s = h @ landmark.cov @ h.T + noise(expected.range, measurement, model)
     nu = measurement.value - expected.value
+    if model.sensor == "bearing":
+        bent = expected.hessian @ landmark.cov
+        nu = nu - np.trace(bent) / 2
+        s = s + np.trace(bent @ bent) / 2
     if model.sensor != "position":
         nu[-1] = wrap(nu[-1])  # the bearing comes last
     squared = nu @ np.linalg.inv(s) @ nu
@@ -100,17 +117,51 @@ def update(landmark, measurement, s, model):
     """Correct one landmark in place (paper, eq. 5 for one factor of eq. 6).
 
     Returns the log predictive density of the measurement: what it adds to the particle's weight.
+    For `bearing` it is that of a mixture: a normal each for near, middling and far.
     """
-    expected = predict(landmark, s, model)
+    if model.sensor == "bearing":
+        shares, parts = zip(*apart(landmark), strict=True)
+        centre = landmark.mean[0]
+        densities = [correct(part, measurement, s, model, centre) for part in parts]
+        logs = np.log(shares) + densities
+        log_density = np.logaddexp.reduce(logs)
+        merge(landmark, np.exp(logs - log_density), parts)
+        landmark.mean[1] = max(landmark.mean[1], MIN_INV_DEPTH)
+    else:
+        log_density = correct(landmark, measurement, s, model)
+    landmark.count += 1
+    return log_density
+
+
+def correct(landmark, measurement, s, model, centre=None):
+    """The Kalman update in place, and the measurement's log density."""
+    expected = predict(landmark, s, model, centre)
     nu, nu_cov, log_density = innovation(landmark, measurement, expected, model)
     gain = landmark.cov @ expected.jacobian.T @ np.linalg.inv(nu_cov)
     landmark.mean = landmark.mean + gain @ nu
-    cov = (np.eye(2) - gain @ expected.jacobian) @ landmark.cov
+    cov = landmark.cov - gain @ nu_cov @ gain.T
     landmark.cov = (cov + cov.T) / 2
-    if model.sensor == "bearing":
-        landmark.mean[1] = max(landmark.mean[1], MIN_INV_DEPTH)
-    landmark.count += 1
     return log_density
+
+
+def apart(landmark):
+    """(weight, Landmark) of narrower normals in a row along inverse depth, which together have the
+    landmark's mean and covariance: Gauss-Hermite points, and the rest of the variance in each."""
+    points, weights = np.polynomial.hermite_e.hermegauss(PARTS)
+    step = landmark.cov[:, 1] / math.sqrt(landmark.cov[1, 1])
+    narrow = landmark.cov - APART * np.outer(step, step)
+    for point, weight in zip(points, weights / weights.sum(), strict=True):
+        mean = landmark.mean + math.sqrt(APART) * point * step
+        yield weight, replace(landmark, mean=mean, cov=narrow)
+
+
+def merge(landmark, weights, parts):
+    """Give the landmark the mean and covariance of the mixture of `parts`."""
+    means = np.array([part.mean for part in parts])
+    landmark.mean = weights @ means
+    between = (means - landmark.mean).T @ np.diag(weights) @ (means - landmark.mean)
+    within = sum(w * part.cov for w, part in zip(weights, parts, strict=True))
+    landmark.cov = within + between
 
 
 def create(measurement, s, birth, model):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import geometry, motion, sensors
+from jaxslam import geometry, landmarks, motion, sensors
 from jaxslam.geometry import wrap
 
 
@@ -75,22 +75,22 @@ def inform(sensor, sensor_pose, axes, world, match, measurements, params):
         anchor = None if world.anchor is None else tuple(world.anchor[:, slot, lane])
         seen = sensors.observe(sensor, sensor_pose, mean, anchor, params)
         by_u = rows(sensor, sensor_pose, axes, mean, anchor, seen.value)
-        spread = [geometry.transpose_times(factor, row) for row in seen.rows]
         value, cov = measurements.value[k], measurements.cov[k]
-        for h, rest, variance in _independent(sensor, seen, spread, by_u, value, cov, params):
+        for h, rest, variance in _independent(sensor, seen, factor, by_u, value, cov, params):
             whitened = _update(whitened, h, rest, variance, matched)
         return whitened
 
     return jax.lax.fori_loop(0, match.shape[0], step, start)
 
 
-def _independent(sensor, seen, spread, by_u, value, cov, params):
+def _independent(sensor, seen, factor, by_u, value, cov, params):
     """Independent scalars (row by u, innovation, variance) of one measurement."""
-    first = sensor != "range_bearing"
+    spread = [geometry.transpose_times(factor, row) for row in seen.rows]
     v0 = value[0] - seen.value[0]
     if sensor == "bearing":
-        s00 = spread[0][0] ** 2 + spread[0][1] ** 2 + seen.noise[0]
-        return [(by_u[0], wrap(v0), s00)]
+        shift, extra = landmarks.bend(spread[0], geometry.transpose_times(factor, seen.stretch))
+        s00 = spread[0][0] ** 2 + spread[0][1] ** 2 + extra + seen.noise[0]
+        return [(by_u[0], wrap(v0 - shift), s00)]
     v1 = value[1] - seen.value[1]
     if sensor == "position":
         xx, xy, yy = (component * params.position_scale**2 for component in cov)

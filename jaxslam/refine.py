@@ -14,6 +14,7 @@ import numpy as np
 from jaxslam import bundle, chain, regroup
 
 ROUNDS = 10
+TRIES = 3  # times that a landmark may enter the map
 WIDE, WIDER, NARROW = (8.0, 4.0, 2.0, 1.0), (4.0, 2.0, 1.0), (1.0,)  # kernels: `bundle.fit`
 
 
@@ -85,13 +86,15 @@ def _groups(name, place, known):
 def _rounds(given, path, groups, known, progress):
     """Solve and check again until nothing changes: `Fit`, the `Groups` solved for, and counts."""
     widths, done, iterations, merged = WIDE, 0, 0, 0
+    tries = np.full(len(groups.label), TRIES)
+    groups = _located(given, path, groups, tries)
     while True:
-        groups = regroup.located(given, path, groups)
         rows, which = regroup.inside(groups)
         fit = bundle.fit(given, path, groups.point[rows], which, widths, progress)
         path, done, iterations = fit.path, done + 1, iterations + fit.iterations
         groups.point[rows] = fit.points
         after, count = regroup.checked(given, fit, groups, known)
+        after = _located(given, path, after, tries)
         settled = np.array_equal(after.of, groups.of) and np.array_equal(
             np.isfinite(after.point), np.isfinite(groups.point)
         )
@@ -101,6 +104,15 @@ def _rounds(given, path, groups, known, progress):
         merged += count
         widths = WIDER if count else NARROW
         groups = after
+
+
+def _located(given, path, groups, tries):
+    """`regroup.located` of the groups that still have a try: one whose depth is at the limit would
+    come and go for ever. Counts `tries` [G] down."""
+    after = regroup.located(given, path, groups)
+    new = np.isfinite(after.point[:, 0]) & ~np.isfinite(groups.point[:, 0])
+    tries[new] -= 1
+    return after._replace(point=np.where((new & (tries < 0))[:, None], np.nan, after.point))
 
 
 def _refined(frames, given, fit, groups, place, counts, known):

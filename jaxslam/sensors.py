@@ -41,13 +41,19 @@ class Measurements(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """Prediction of one landmark: its measurement, rows of the Jacobian, noise, where it is."""
+    """Prediction of one landmark: its measurement, rows of the Jacobian, noise, where it is.
+
+    `stretch`: for `bearing`, the derivative by the landmark of the logarithm of `ray`'s length.
+    With the bearing's row h, the bearing's Hessian is -(stretch h' + h stretch'), but for the
+    curvature of the ray's own direction.
+    """
 
     value: tuple
     rows: tuple
     noise: tuple
     range: jax.Array
     bearing: jax.Array
+    stretch: tuple = ()
 
 
 def rescaled(measurements, params):
@@ -87,21 +93,32 @@ def bearing_variance(r, params):
     return params.sigma_bearing**2 + (params.growth / r) ** 2
 
 
+def ray(sensor_pose, mean, anchor):
+    """A `bearing` landmark from the sensor, in world axes and divided by its depth: (x, y); and its
+    derivatives by direction and by inverse depth, in which latter it is linear."""
+    c, s = jnp.cos(mean[0]), jnp.sin(mean[0])
+    ax, ay = anchor[0] - sensor_pose[0], anchor[1] - sensor_pose[1]
+    return (mean[1] * ax + c, mean[1] * ay + s), (-s, c), (ax, ay)
+
+
+def along_ray(point, by_direction, by_depth, depth, heading, params):
+    """`Seen` of what `ray` gave."""
+    (dx, dy), (tx, ty), (ax, ay) = point, by_direction, by_depth
+    q = norm(dx, dy)
+    bearing = wrap(direction(dy, dx) - heading)
+    scale = 1 / (q * q)
+    row = ((dx * ty - dy * tx) * scale, (dx * ay - dy * ax) * scale)
+    stretch = ((dx * tx + dy * ty) * scale, (dx * ax + dy * ay) * scale)
+    r = q / jnp.maximum(depth, LEAST_INVERSE_DEPTH)
+    variance = params.sigma_bearing**2 + (params.growth * depth / q) ** 2
+    return Seen((bearing,), (row,), (variance,), r, bearing, stretch)
+
+
 def observe(sensor, sensor_pose, mean, anchor, params):
     """`Seen` of a landmark; `noise` holds the variances, and is empty for `position`."""
     sx, sy, heading = sensor_pose
     if sensor == "bearing":
-        angle, depth = mean
-        c, s = jnp.cos(angle), jnp.sin(angle)
-        ax, ay = anchor[0] - sx, anchor[1] - sy
-        dx, dy = depth * ax + c, depth * ay + s
-        q = norm(dx, dy)
-        bearing = wrap(direction(dy, dx) - heading)
-        scale = 1 / (q * q)
-        row = ((dy * s + dx * c) * scale, (dx * ay - dy * ax) * scale)
-        r = q / jnp.maximum(depth, LEAST_INVERSE_DEPTH)
-        variance = params.sigma_bearing**2 + (params.growth * depth / q) ** 2
-        return Seen((bearing,), (row,), (variance,), r, bearing)
+        return along_ray(*ray(sensor_pose, mean, anchor), mean[1], heading, params)
     dx, dy = mean[0] - sx, mean[1] - sy
     r = norm(dx, dy)
     bearing = wrap(direction(dy, dx) - heading)

@@ -1,5 +1,7 @@
 """The map of a particle, against plain NumPy in double precision and numbers worked out by hand."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -82,7 +84,7 @@ def padded(value):
     return tuple(np.append(value, 0.0)[:2])
 
 
-@pytest.mark.parametrize("sensor", SENSORS)
+@pytest.mark.parametrize("sensor", ["position", "range_bearing"])
 @pytest.mark.parametrize("seed", range(4))
 def test_update_is_the_kalman_filter_in_covariance_form(x64, sensor, seed):
     mean, factor, anchor, value = case(sensor, seed)
@@ -94,6 +96,77 @@ def test_update_is_the_kalman_filter_in_covariance_form(x64, sensor, seed):
     np.testing.assert_allclose(got, want_mean, atol=1e-8)
     np.testing.assert_allclose(matrix(geometry.covariance(root)), want_cov, atol=1e-8)
     assert float(density) == pytest.approx(want_density, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_well_known_bearing_landmark_is_a_kalman_filter(x64, seed):
+    mean, factor, anchor, value = case("bearing", seed)
+    factor = factor / 100
+    cov = matrix(geometry.covariance(factor))
+    got, root, density = landmarks.update(
+        "bearing", SENSOR_POSE, tuple(mean), tuple(factor), anchor, padded(value), COV, PARAMS
+    )
+    want_mean, want_cov, want_density = kalman("bearing", mean, cov, anchor, value)
+    np.testing.assert_allclose(got - mean, want_mean - mean, rtol=0.02, atol=1e-8)
+    np.testing.assert_allclose(matrix(geometry.covariance(root)), want_cov, rtol=2e-3, atol=1e-11)
+    assert float(density) == pytest.approx(want_density, abs=1e-3)
+
+
+def on_a_grid(first, sigma, growth, values, x, size=200):
+    """Mean and covariance of (direction, inverse depth) given bearings at (x, 0), sensor ahead."""
+    phi = (first + np.linspace(-5, 5, size) * sigma)[:, None]
+    rho = np.linspace(1e-3, PARAMS.inv_depth_mean + 5 * PARAMS.inv_depth_sd, size)[None]
+    log_p = -0.5 * ((phi - first) ** 2 / (sigma**2 + growth**2 * rho**2))
+    log_p = log_p - 0.5 * np.log(sigma**2 + growth**2 * rho**2)
+    log_p = log_p - 0.5 * ((rho - PARAMS.inv_depth_mean) / PARAMS.inv_depth_sd) ** 2
+    for value, at in zip(values, x, strict=True):
+        dx, dy = np.cos(phi) - rho * at, np.sin(phi)
+        variance = sigma**2 + growth**2 * rho**2 / (dx**2 + dy**2)
+        log_p = log_p - 0.5 * wrap(value - np.arctan2(dy, dx)) ** 2 / variance
+        log_p = log_p - 0.5 * np.log(variance)
+    p = np.exp(log_p - log_p.max())
+    p = p / p.sum()
+    mean = np.array([(p * phi).sum(), (p * rho).sum()])
+    d0, d1 = phi - mean[0], rho - mean[1]
+    return mean, [
+        [(p * d0 * d0).sum(), (p * d0 * d1).sum()],
+        [(p * d0 * d1).sum(), (p * d1**2).sum()],
+    ]
+
+
+@pytest.mark.parametrize("ahead", [0.0, 3.0, 10.0, 60.0])
+def test_a_bearing_landmark_stays_with_the_exact_posterior(ahead):
+    """2 m driven past it or towards it, depth drawn from the prior: expected NEES under the exact
+    posterior, which should be 2. One EKF has hundreds straight ahead."""
+    rng, draws, sigma, growth = np.random.default_rng(5), 40, np.deg2rad(4), 0.02
+    params = PARAMS._replace(sigma_bearing=float(sigma), growth=growth)
+    first = np.deg2rad(ahead)
+    rho = np.abs(rng.normal(params.inv_depth_mean, params.inv_depth_sd, draws))
+    phi = first + rng.normal(size=draws) * np.hypot(sigma, growth * rho)
+    x = 0.1 * np.arange(1, 21)
+    dx, dy = np.cos(phi) - rho * x[:, None], np.sin(phi) + 0 * x[:, None]
+    noise = np.sqrt(sigma**2 + growth**2 * rho**2 / (dx**2 + dy**2))
+    values = np.arctan2(dy, dx) + noise * rng.normal(size=dx.shape)
+
+    zero = jnp.zeros(draws)
+    mean, factor, anchor = sensors.locate("bearing", (zero, zero, zero), (first, 0.0), None, params)
+
+    def look(state, seen):
+        at, value = seen
+        pose = (zero + at, zero, zero)
+        after = landmarks.update("bearing", pose, *state, anchor, (value, 0.0), None, params)
+        return after[:2], after[2]
+
+    given = jnp.asarray(x, jnp.float32), jnp.asarray(values, jnp.float32)
+    (mean, factor), _ = jax.jit(lambda s, g: jax.lax.scan(look, s, g))((mean, factor), given)
+    cov = np.moveaxis(matrix(np.asarray(geometry.covariance(factor), float)), -1, 0)
+    nees = []
+    for i in range(draws):
+        exact_mean, exact_cov = on_a_grid(first, sigma, growth, values[:, i], x)
+        off = exact_mean - np.asarray(mean, float)[:, i]
+        nees.append(np.trace(np.linalg.solve(cov[i], exact_cov + np.outer(off, off))))
+    assert 1.0 < np.median(nees) < 3.0
+    assert np.mean(nees) < 10.0
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
@@ -214,6 +287,7 @@ def anchors(world):
 
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_score_is_the_updates_log_density(x64, sensor):
+    """Of a bearing it is one normal's, to second order: the baseline's."""
     world = world_of(sensor, [[1, 0, 3], [2, 1, 0]])
     seen = sensors.observe(sensor, poses(3), tuple(world.mean), anchors(world), PARAMS)
     scorer = landmarks.scorer(sensor, seen, world, np.log(0.9))
@@ -226,6 +300,13 @@ def test_score_is_the_updates_log_density(x64, sensor):
                 sensor, SENSOR_POSE, tuple(world.mean[:, m, n]), tuple(world.factor[:, m, n]),
                 anchor, value, COV, PARAMS,
             )  # fmt: skip
+            if sensor == "bearing":
+                cov = matrix(geometry.covariance(world.factor[:, m, n]))
+                mark = baseline_ekf.Landmark(world.mean[:, m, n], cov, anchor, 1, 0.0, 0)
+                model = make_model(PARAMS, Config(sensor=sensor))
+                expected = baseline_ekf.predict(mark, SENSOR_POSE, model)
+                measured = SimpleNamespace(value=np.array(value[:1]), cov=None)
+                density = baseline_ekf.innovation(mark, measured, expected, model)[2].item()
             expected = np.log(0.9) + float(density) if world.count[m, n] else -np.inf
             assert float(got[m, n]) == pytest.approx(expected, abs=1e-9)
 

@@ -1,10 +1,12 @@
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import geometry, sensors
-from jaxslam.config import SENSORS, default_params
+from jaxslam import baseline, geometry, sensors
+from jaxslam.config import SENSORS, Config, default_params
 
 PARAMS = default_params()._replace(mount_x=0.2, mount_y=-0.1, mount_yaw=0.3, growth=0.02)
 COV = (0.04, 0.01, 0.02)
@@ -141,3 +143,39 @@ def test_gradients_by_parameters_are_finite_at_the_landmark(sensor):
 
     gradient = jax.grad(total)(PARAMS._replace(mount_x=0.0, mount_y=0.0))
     assert np.isfinite(np.array(gradient)).all()
+
+
+def test_correlated_noise_is_that_of_an_autoregression_averaged(x64):
+    """The mean of many AR(1) errors is as certain as that of independent ones so inflated."""
+    params = PARAMS._replace(correlation=0.4, sigma_bearing=0.03)
+    noisy = sensors.correlated(params, SimpleNamespace(distance=jnp.asarray(0.1)))
+    apart = 0.1 * np.abs(np.subtract.outer(np.arange(1500), np.arange(1500)))
+    inflation = np.exp(-apart / 0.4).sum() / 1500
+    for name in ("sigma_range", "sigma_bearing", "growth", "position_scale"):
+        ratio = float(getattr(noisy, name)) / getattr(params, name)
+        assert ratio**2 == pytest.approx(inflation, rel=0.01)
+    assert noisy.outlier == params.outlier
+
+
+def test_a_robot_that_stands_learns_next_to_nothing_and_white_errors_stay(x64):
+    params, still = PARAMS._replace(correlation=0.4), SimpleNamespace(distance=jnp.asarray(0.0))
+    ratio = float(sensors.correlated(params, still).sigma_range) / params.sigma_range
+    assert ratio**2 == pytest.approx(sensors.MOST_INFLATION, rel=1e-3)
+    white = sensors.correlated(PARAMS._replace(correlation=0.0), still)
+    assert float(white.sigma_range) == PARAMS.sigma_range
+
+    def noise(correlation, distance):
+        moved = SimpleNamespace(distance=distance)
+        return sensors.correlated(PARAMS._replace(correlation=correlation), moved).sigma_bearing
+
+    for correlation, distance in ((0.0, 0.0), (0.4, 0.0), (0.4, 0.1), (1e-3, 5.0)):
+        assert np.isfinite(jax.grad(noise, (0, 1))(correlation, distance)).all()
+
+
+@pytest.mark.parametrize("distance", [0.0, 0.03, 1.0, 100.0])
+def test_correlated_noise_is_the_baselines(x64, distance):
+    params, moved = PARAMS._replace(correlation=0.4), SimpleNamespace(distance=distance)
+    noisy = sensors.correlated(params, moved)
+    model = baseline.dulled(baseline.make_model(params, Config()), distance)
+    for name in ("sigma_range", "sigma_bearing", "growth", "position_scale"):
+        assert getattr(model, name) == pytest.approx(float(getattr(noisy, name)), rel=1e-9)
