@@ -2,9 +2,13 @@
 
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxslam import filter as fastslam
+from jaxslam import landmarks as maps
 from jaxslam import runner
 from jaxslam.config import Config, default_params
 from jaxslam.evaluate import ate
@@ -80,6 +84,24 @@ def test_landmarks_are_a_table(result):
     assert (world.n >= 1).all()
     np.testing.assert_array_equal(world.identity, -1)  # identities were hidden
     assert (world.cov[:, 0] * world.cov[:, 2] > world.cov[:, 1] ** 2).all()
+
+
+def test_landmarks_without_a_depth_stay_out_of_the_map():
+    config = Config(sensor="bearing", particles=2, landmarks=3, measurements=1, forgetting=False)
+    state = fastslam.init(config, jax.random.key(0))
+    depth, sd = jnp.array([0.5, 0.5, 0.5]), jnp.array([0.01, 0.25, 0.01])
+    given = jnp.stack([jnp.zeros(3), depth]), jnp.stack([jnp.full(3, 0.01), jnp.zeros(3), sd])
+    world = maps.fill(state.landmarks, (*given, jnp.ones((2, 3))))
+    # The third slot is empty.
+    world = world._replace(
+        count=world.count.at[2].set(0), birth=jnp.array([[7, 7], [8, 8], [9, 9]], jnp.int32)
+    )
+    params = default_params("bearing")
+    found = runner._map(
+        state._replace(landmarks=world), 0, params, config, np.empty(0, int), np.array([5.0, 0, 0])
+    )
+    np.testing.assert_array_equal(found.id, [7])
+    np.testing.assert_allclose(found.mean, [[5 + 1 + 2, 1]], atol=1e-5)
 
 
 def test_result_means_something(log, config, result):
