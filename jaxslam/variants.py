@@ -17,8 +17,8 @@ from jaxslam.evaluate import align_se2, alignable, ate, map_error, truth_at, wit
 
 class Variant(NamedTuple):
     """One row: RMSE [m] of the path, `aligned` and not, and of the `landmarks` (aligned with the
-    path), NaN without truth; `counts` of landmarks matched, missed and spurious; `seconds` per step, without the filter's
-    compilation but with that of refining."""
+    path), NaN without truth; `counts` of landmarks matched, missed and spurious; `seconds` per
+    step, without the filter's compilation but with that of refining."""
 
     name: str
     particles: int
