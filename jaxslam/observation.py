@@ -39,6 +39,7 @@ def observe(pose, world, chance, odometry, measurements, params, config, number)
     """`Observed` of N particles; `pose` [3, N] is from before the motion, `number` the step's."""
     n, size = config.particles, block_size(config)
     measurements = sensors.rescaled(measurements, params)
+    params = sensors.noisier(params, params.inflation)
     if not config.clutter:
         params = params._replace(outlier=jnp.zeros(()))
     # Outside the loop: XLA would work out cosine and sine again for every landmark.
