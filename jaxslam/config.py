@@ -91,9 +91,10 @@ class Params(NamedTuple):
     radian turned, `err_drift**2` rad^2 per metre, and the floors per second. Gains are true over
     measured odometry. The bearing's variance is `sigma_bearing**2 + (growth / range)**2`: a tube or
     a door edge has a size. Errors of one landmark's measurements stay alike over a path of
-    `correlation`: standing still tells nothing new (0: always independent). The filter takes
-    measurements' standard deviations times `inflation`, since its particles are few and its
-    landmarks' EKFs linear; refinement takes them as they are. `view_*` is what the sensor can see
+    `correlation`: standing still tells nothing new (0: always independent). `caution` is added to
+    the bearing's standard deviation in quadrature by the filter, since its particles are few and
+    errors are not as independent as it takes them to be; refinement does without. `view_*` is what
+    the sensor can see
     and is declared by the log.
     """
 
@@ -110,7 +111,7 @@ class Params(NamedTuple):
     growth: float
     position_scale: float
     correlation: float
-    inflation: float
+    caution: float
     mount_x: float
     mount_y: float
     mount_yaw: float
@@ -143,7 +144,7 @@ UNITS = {
     "growth": "m",
     "position_scale": "factor",
     "correlation": "m",
-    "inflation": "factor",
+    "caution": "rad",
     "mount_x": "m",
     "mount_y": "m",
     "mount_yaw": "rad",
@@ -178,7 +179,7 @@ _DEFAULTS = Params(
     growth=0.12,
     position_scale=1.0,
     correlation=0.0,
-    inflation=1.0,
+    caution=0.0,
     mount_x=0.0,
     mount_y=0.0,
     mount_yaw=0.0,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import association, landmarks, motion, proposal, sensors
+from jaxslam import association, geometry, landmarks, motion, proposal, sensors
 from jaxslam.association import CLUTTER, NEW
 from jaxslam.landmarks import Landmarks
 
@@ -39,7 +39,7 @@ def observe(pose, world, chance, odometry, measurements, params, config, number)
     """`Observed` of N particles; `pose` [3, N] is from before the motion, `number` the step's."""
     n, size = config.particles, block_size(config)
     measurements = sensors.rescaled(measurements, params)
-    params = sensors.noisier(params, params.inflation)
+    params = params._replace(sigma_bearing=geometry.norm(params.sigma_bearing, params.caution))
     if not config.clutter:
         params = params._replace(outlier=jnp.zeros(()))
     # Outside the loop: XLA would work out cosine and sine again for every landmark.

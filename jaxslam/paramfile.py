@@ -26,7 +26,7 @@ MEANING = {
     "growth": "sideways noise of what is seen: it has a size",
     "position_scale": "multiplies the standard deviations of positions",
     "correlation": "path over which errors stay alike",
-    "inflation": "the filter's caution: on standard deviations of measurements",
+    "caution": "bearing noise that the filter adds",
     "mount_x": "sensor on the robot, forward",
     "mount_y": "sensor on the robot, left",
     "mount_yaw": "sensor on the robot, counter-clockwise",
@@ -45,10 +45,9 @@ MEANING = {
     "existence_confirm": "from here on it is in the map",
 }
 ABOVE_ZERO = ("gain_tran", "gain_rot", "sigma_range", "sigma_bearing", "position_scale")
-ABOVE_ZERO += ("inflation", "density_new", "view_range", "inv_depth_mean", "inv_depth_sd")
-ABOVE_ZERO += ("existence_max",)
+ABOVE_ZERO += ("density_new", "view_range", "inv_depth_mean", "inv_depth_sd", "existence_max")
 AT_LEAST_ZERO = ("err_tran", "err_rot", "err_drift", "floor_tran", "floor_rot", "growth")
-AT_LEAST_ZERO += ("correlation", "existence_seen", "existence_miss")
+AT_LEAST_ZERO += ("correlation", "caution", "existence_seen", "existence_miss")
 ERRORS = "standard_error"
 MAX_BYTES = 1 << 20
 

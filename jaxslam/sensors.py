@@ -18,7 +18,6 @@ import jax.numpy as jnp
 from jaxslam import geometry
 from jaxslam.geometry import direction, norm, wrap
 
-NOISE = ("sigma_bearing", "growth", "sigma_range", "position_scale")
 LEAST_INVERSE_DEPTH = 1e-3
 MOST_INFLATION = 1e4  # of a variance, when the robot stands
 LOG_2PI = math.log(2 * math.pi)
@@ -80,12 +79,8 @@ def correlated(params, odometry):
     half = odometry.distance / (2 * jnp.where(on, params.correlation, 1.0))
     inflation = 1 / jnp.tanh(jnp.clip(half, 1 / MOST_INFLATION, 10.0))
     root = jnp.where(on, jnp.sqrt(inflation), 1.0)
-    return noisier(params, root)
-
-
-def noisier(params, factor):
-    """`Params` with the standard deviations of all measurements times `factor`."""
-    return params._replace(**{name: getattr(params, name) * factor for name in NOISE})
+    names = ("sigma_bearing", "growth", "sigma_range", "position_scale")
+    return params._replace(**{name: getattr(params, name) * root for name in names})
 
 
 def pose_of(pose, params):

@@ -79,7 +79,8 @@ def _draw(given):
     looks = [_look(rng, p, marks, given) for p in pose]
     ranges, bearings, identity = (np.concatenate(column) for column in zip(*looks, strict=True))
     noise = {name: getattr(given, name) for name in NOISE}
-    noise["density_new"] = given.landmarks / area
+    # Drawn from the model itself: nothing to be cautious of.
+    noise |= {"density_new": given.landmarks / area, "caution": 0.0}
     return Log(
         name=f"planar-{given.world}-{given.seed}",
         odometry_time=odometry_time,
