@@ -10,10 +10,12 @@ The landmark's point is estimated from a prior of 1 m and Jacobians at the truth
 but the noise model can be wrong:
 - `white`: every frame by itself;
 - `inflated`: variance times coth(distance / (2 correlation)), as `sensors.correlated`;
-- `inflated, turning too`: of distance + 0.5 m/rad times turn;
+- `inflated, 0.2 m/rad`: of distance + 0.2 m/rad times turn; so with 0.1 and 0.5;
 - `thinned`: a frame only after `correlation` m or 0.3 rad;
 - `whitened`: the difference from the last frame's residual, by the autoregression.
 NEES (should be 2), share of truths in the 95 % ellipse, and RMSE in mm after each leg.
+A second table asks what the last leg is worth to the pose: the heading while turning once in place,
+with 8 known landmarks around, `err_rot` 0.05 rad per root rad, by levers: NEES (should be 1), RMSE.
 Writes experiments/results/correlation.md.
 """
 
@@ -25,7 +27,7 @@ from scipy.stats import chi2
 RESULTS = Path(__file__).parent / "results"
 DRAWS, SIGMA, CORRELATION = 4000, np.deg2rad(2), 0.3  # rad, m
 LEGS = {"stood 30 s": 150, "drove 0.5 m": 155, "drove 4 m": 190, "turned": 220}  # frames by then
-LEVER, LEAST_TURN = 0.5, 0.3  # m/rad, rad
+LEVERS, LEAST_TURN = (0.1, 0.2, 0.5), 0.3  # m/rad, rad
 MARK, MOST = np.array([2.0, 1.5]), 1e4
 
 
@@ -48,14 +50,10 @@ def errors(kind, share, rng):
             a = np.exp(-d / CORRELATION) if t else 0.0
             state = a * state + np.sqrt(1 - a * a) * rng.normal(size=DRAWS)
             alike[t] = state
-    else:  # a normal process over the circle, alike over about 0.2 rad
+    else:
         seen_from = np.arctan2(MARK[1], MARK[0] - x)
         angle = seen_from if kind == "aspect" else seen_from - heading
-        order = np.arange(1, 40)
-        size = np.exp(-0.5 * (0.2 * order) ** 2)
-        waves = rng.normal(size=(2, len(order), DRAWS)) * (size / np.sqrt(np.sum(size**2)))[:, None]
-        phase = angle[:, None] * order
-        alike = np.cos(phase) @ waves[0] + np.sin(phase) @ waves[1]
+        alike = smooth(angle, rng)
     return SIGMA * (np.sqrt(share) * alike + np.sqrt(1 - share) * white)
 
 
@@ -74,7 +72,8 @@ def weighted(method, error):
     _, _, distance, turn = path()
     h, variance = rows(), np.full(len(distance), SIGMA**2)
     if method.startswith("inflated"):
-        travel = distance + LEVER * turn * (method != "inflated")
+        lever = 0.0 if method == "inflated" else float(method.split()[1])
+        travel = distance + lever * turn
         variance[1:] *= inflation(travel[1:])  # the first is new, whatever was driven
     elif method == "thinned":
         moved = turned = np.inf
@@ -109,8 +108,39 @@ def measure(method, error):
     return out
 
 
+def smooth(angle, rng):
+    """Normal processes over the circle, alike over about 0.2 rad, variance 1: [*angle, DRAWS]."""
+    order = np.arange(1, 40)
+    size = np.exp(-0.5 * (0.2 * order) ** 2)
+    waves = rng.normal(size=(2, len(order), DRAWS)) * (size / np.sqrt(np.sum(size**2)))[:, None]
+    phase = np.asarray(angle)[..., None] * order
+    return np.cos(phase) @ waves[0] + np.sin(phase) @ waves[1]
+
+
+def turning(kind, lever, steps=30, landmarks=8, err_rot=0.05):
+    """(NEES, RMSE in degrees) of the heading after a turn in place, by a Kalman filter."""
+    rng, turn = np.random.default_rng(0), 2 * np.pi / steps
+    place, constant = rng.uniform(-np.pi, np.pi, landmarks), rng.normal(size=(landmarks, DRAWS))
+    angle = place - turn * np.arange(steps)[:, None]
+    alike = (
+        smooth(angle, rng)
+        if kind == "lens"
+        else np.broadcast_to(constant, (steps, *constant.shape))
+    )
+    grown = 1.0 if lever is None else inflation(np.array(lever * turn))
+    error, variance, noise = np.zeros(DRAWS), 0.0, grown * SIGMA**2 / landmarks
+    for t in range(steps):
+        error = error + err_rot * np.sqrt(turn) * rng.normal(size=DRAWS)
+        variance = variance + err_rot**2 * turn
+        gain = variance / (variance + noise)
+        error = error - gain * (error + SIGMA * alike[t].mean(0))
+        variance = (1 - gain) * variance
+    return np.mean(error**2) / variance, np.rad2deg(np.sqrt(np.mean(error**2)))
+
+
 def main():
-    methods = ("white", "inflated", "inflated, turning too", "thinned", "whitened")
+    levers = tuple(f"inflated, {lever} m/rad" for lever in LEVERS)
+    methods = ("white", "inflated", *levers, "thinned", "whitened")
     lines = [
         f"{DRAWS} draws; {np.rad2deg(SIGMA):.0f}°; correlation {CORRELATION} m."
         " NEES (should be 2), share in the 95 % ellipse, RMSE.",
@@ -125,6 +155,11 @@ def main():
         for method in methods:
             cells = (f"{n:.3g}, {c:.0%}, {r:.0f} mm" for n, c, r in measure(method, error))
             lines.append(f"| {name} | {method} | " + " | ".join(cells) + " |")
+    lines += ["", "| errors | white | inflated | " + " | ".join(levers) + " |"]
+    lines.append("|---|" + "--:|" * (2 + len(levers)))
+    for name in ("of each landmark, constant", "lens"):
+        got = [turning(name, lever) for lever in (None, 0.0, *LEVERS)]
+        lines.append(f"| {name} | " + " | ".join(f"{n:.2f}, {r:.1f}°" for n, r in got) + " |")
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / "correlation.md").write_text("\n".join(lines) + "\n")
     print(*lines, sep="\n")

@@ -1,4 +1,4 @@
-"""Is a bearing landmark honest? `python experiments/inverse_depth.py` (15 minutes, one core).
+"""Is a bearing landmark honest? `python experiments/inverse_depth.py` (5 minutes, one core).
 
 One landmark, known poses: the robot drives 4 m straight on, a bearing every 0.1 m. The landmark is
 drawn from the filter's prior given the first bearing (direction N(z, sigma^2), inverse depth
@@ -31,7 +31,8 @@ from jaxslam.config import default_params
 
 RESULTS = Path(__file__).parent / "results"
 STEP, CHECKS = 0.1, (1, 3, 10, 20, 40)  # m; frames at which all is measured
-GRID, KEPT = 96, 18.0  # points a side; log density below the top that still belongs to the grid
+CHUNK = 20  # draws at once: what stays in cache is three times as fast
+GRID, KEPT = 64, 16.0  # points a side; log density below the top that still belongs to the grid
 PRIOR = default_params("bearing")
 # name, first bearing, sigma (degrees), growth (m), depth (m) or None: from the prior
 CASES = (
@@ -253,8 +254,7 @@ def covered(truth, mean, cov):
 
 
 def measure(case, count, seed):
-    """{(method, frames): measures [6, D]}: NEES, bits of truth, KL, covered, bits of next, NEES of
-    the moments."""
+    """{(method, frames): measures [5, D]}: NEES, bits of truth lost, KL, covered, evidence lost."""
     rng = np.random.default_rng(seed)
     truth, z = draw(case, count, rng)
     first, noise = np.deg2rad(case[1]), (np.deg2rad(case[2]), case[3])
@@ -276,7 +276,9 @@ def measure(case, count, seed):
             states[name] = mean, cov
             told[name] = told[name] + density
         if frame not in CHECKS:
-            if frame % 2 == 0:  # so that what is left of the prior is never lost between points
+            if (
+                frame % (2 if frame < 20 else 5) == 0
+            ):  # so that what is left of the prior is never lost between points
                 box = exact(case, z[:frame], box)[-1]
             continue
         phi, rho, log_p, cell, box = exact(case, z[:frame], box)
@@ -348,7 +350,8 @@ def main():
     ]
     print(*lines, sep="\n", flush=True)
     for i, case in enumerate(CASES[: given.cases]):
-        rows = table(case, measure(case, given.draws, i))
+        chunks = [measure(case, CHUNK, (i, j)) for j in range(given.draws // CHUNK)]
+        rows = table(case, {key: np.hstack([c[key] for c in chunks]) for key in chunks[0]})
         print(*rows, sep="\n", flush=True)
         lines += rows
     if given.draws == 200 and given.cases == len(CASES):

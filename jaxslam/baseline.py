@@ -187,15 +187,18 @@ def forget(particle, before, matched, s, model):
     return freed
 
 
-def dulled(model, distance):
-    """The model for measurements whose errors live on over `correlation` metres of path.
+def dulled(model, o):
+    """The model for measurements whose errors live on over `correlation` metres of path, a radian
+    of turning counting as a tenth of a metre.
 
     An AR(1) process with e-folding path L, read every d: its mean over many reads has the variance
     of white reads (1 + a) / (1 - a) times as noisy, with a = exp(-d / L).
     """
     if model.correlation == 0:
         return model
-    alike = math.exp(-min(max(distance / model.correlation, 2 / MOST_DULLED), 20.0))
+    alike = math.exp(
+        -min(max((o.distance + o.turn / 10) / model.correlation, 2 / MOST_DULLED), 20.0)
+    )
     ratio = (1 + alike) / (1 - alike)
     noisy = ("sigma_range", "sigma_bearing", "growth", "position_scale")
     louder = {name: getattr(model, name) * math.sqrt(ratio) for name in noisy}
@@ -306,7 +309,7 @@ def step(particles, odometry, frame, columns, index, normals, uniform, model):
     outcomes = [([PADDING] * columns, [-1] * columns, 0)] * len(particles)
     row = {"log_evidence": 0.0, "nonfinite": 0, "degenerate": False}
     if frame is not None:
-        dull = dulled(model, odometry.distance)
+        dull = dulled(model, odometry)
         outcomes = [correct(p, frame, columns, index, model, dull) for p in particles]
         row = normalise(particles)
     match, slot, freed = (np.array(part) for part in zip(*outcomes, strict=True))

@@ -19,6 +19,7 @@ from jaxslam import geometry
 from jaxslam.geometry import direction, norm, wrap
 
 LEAST_INVERSE_DEPTH = 1e-3
+TURNING = 0.1  # m/rad: turning makes errors new as so much driving does
 MOST_INFLATION = 1e4  # of a variance, when the robot stands
 LOG_2PI = math.log(2 * math.pi)
 
@@ -73,10 +74,13 @@ def correlated(params, odometry):
 
     Errors that follow a first-order autoregression in the travelled path d have correlation
     exp(-d / correlation) from frame to frame; many such frames tell as much as independent ones
-    with coth(d / (2 correlation)) times the variance.
+    with coth(d / (2 correlation)) times the variance. Turning counts a little (`TURNING`): a lens's
+    errors change with it, and without any looks a turn in place would lose the heading, which
+    errors that stay alike do not spoil (experiments/correlation.py).
     """
     on = params.correlation > 0
-    half = odometry.distance / (2 * jnp.where(on, params.correlation, 1.0))
+    travel = odometry.distance + TURNING * odometry.turn
+    half = travel / (2 * jnp.where(on, params.correlation, 1.0))
     inflation = 1 / jnp.tanh(jnp.clip(half, 1 / MOST_INFLATION, 10.0))
     root = jnp.where(on, jnp.sqrt(inflation), 1.0)
     names = ("sigma_bearing", "growth", "sigma_range", "position_scale")

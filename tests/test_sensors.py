@@ -148,7 +148,9 @@ def test_gradients_by_parameters_are_finite_at_the_landmark(sensor):
 def test_correlated_noise_is_that_of_an_autoregression_averaged(x64):
     """The mean of many AR(1) errors is as certain as that of independent ones so inflated."""
     params = PARAMS._replace(correlation=0.4, sigma_bearing=0.03)
-    noisy = sensors.correlated(params, SimpleNamespace(distance=jnp.asarray(0.1)))
+    noisy = sensors.correlated(
+        params, SimpleNamespace(distance=jnp.asarray(0.07), turn=jnp.asarray(0.3))
+    )
     apart = 0.1 * np.abs(np.subtract.outer(np.arange(1500), np.arange(1500)))
     inflation = np.exp(-apart / 0.4).sum() / 1500
     for name in ("sigma_range", "sigma_bearing", "growth", "position_scale"):
@@ -158,14 +160,17 @@ def test_correlated_noise_is_that_of_an_autoregression_averaged(x64):
 
 
 def test_a_robot_that_stands_learns_next_to_nothing_and_white_errors_stay(x64):
-    params, still = PARAMS._replace(correlation=0.4), SimpleNamespace(distance=jnp.asarray(0.0))
+    params, still = (
+        PARAMS._replace(correlation=0.4),
+        SimpleNamespace(distance=jnp.asarray(0.0), turn=jnp.asarray(0.0)),
+    )
     ratio = float(sensors.correlated(params, still).sigma_range) / params.sigma_range
     assert ratio**2 == pytest.approx(sensors.MOST_INFLATION, rel=1e-3)
     white = sensors.correlated(PARAMS._replace(correlation=0.0), still)
     assert float(white.sigma_range) == PARAMS.sigma_range
 
     def noise(correlation, distance):
-        moved = SimpleNamespace(distance=distance)
+        moved = SimpleNamespace(distance=distance, turn=0.0)
         return sensors.correlated(PARAMS._replace(correlation=correlation), moved).sigma_bearing
 
     for correlation, distance in ((0.0, 0.0), (0.4, 0.0), (0.4, 0.1), (1e-3, 5.0)):
@@ -174,8 +179,9 @@ def test_a_robot_that_stands_learns_next_to_nothing_and_white_errors_stay(x64):
 
 @pytest.mark.parametrize("distance", [0.0, 0.03, 1.0, 100.0])
 def test_correlated_noise_is_the_baselines(x64, distance):
-    params, moved = PARAMS._replace(correlation=0.4), SimpleNamespace(distance=distance)
+    params = PARAMS._replace(correlation=0.4)
+    moved = SimpleNamespace(distance=distance, turn=distance / 2)
     noisy = sensors.correlated(params, moved)
-    model = baseline.dulled(baseline.make_model(params, Config()), distance)
+    model = baseline.dulled(baseline.make_model(params, Config()), moved)
     for name in ("sigma_range", "sigma_bearing", "growth", "position_scale"):
         assert getattr(model, name) == pytest.approx(float(getattr(noisy, name)), rel=1e-9)
