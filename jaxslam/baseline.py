@@ -58,9 +58,13 @@ def numbers(record):
 
 
 def make_model(params, config):
-    """Params' numbers and Config's choices as one record; without clutter nothing is an outlier."""
+    """Params' numbers and Config's choices as one record; without clutter nothing is an outlier.
+
+    Bearings are as noisy as they are with `caution` rad of further, independent error.
+    """
     values = {name: float(value) for name, value in numbers(params).items()}
     model = SimpleNamespace(**values | vars(config))
+    model.sigma_bearing = math.sqrt(model.sigma_bearing**2 + model.caution**2)
     if not model.clutter:
         model.outlier = 0.0
     return model

@@ -16,7 +16,7 @@ STILL |= {"lever": 0.5, "lever_var": 1 / 12}
 MOTION = {"err_tran": 0, "err_rot": 0, "err_drift": 0, "floor_tran": 0, "floor_rot": 0}
 MOTION |= {"gain_tran": 1, "gain_rot": 1, "bias_drift": 0}
 SENSING = {"sigma_range": 0.1, "sigma_bearing": 0.05, "growth": 0.03, "position_scale": 1}
-SENSING |= {"correlation": 0.0}
+SENSING |= {"correlation": 0.0, "caution": 0.0}
 SENSING |= {"mount_x": 0.2, "mount_y": -0.1, "mount_yaw": 0.3, "outlier": 0.02, "density_new": 0.1}
 SENSING |= {"detection": 0.9, "view_min": -2.0, "view_max": 2.0, "view_range": 10.0}
 SENSING |= {"inv_depth_mean": 0.3, "inv_depth_sd": 0.2}
@@ -295,12 +295,18 @@ def test_small_world(sensor, association):
 
 
 @pytest.mark.parametrize("sensor", ["range_bearing", "bearing"])
-def test_correlated_errors_as_in_the_filter(sensor):
+def test_correlated_and_further_errors_as_in_the_filter(sensor):
     log = simulate.planar(length_m=4.0, landmarks=12, seed=3)
     config = Config(sensor=sensor, particles=4, measurements=6, landmarks=10)
-    params = default_params(sensor, log)._replace(correlation=0.3)
-    found = compare.agreement(log, config, params, seed=1)
-    assert found.same == found.steps
-    assert max(found.pose, found.log_weight, found.landmarks) <= 1e-9
-    white = compare.agreement(log, config, params._replace(correlation=0.0), seed=1)
-    assert np.abs(found.pose_filter - white.pose_filter).max() > 1e-3
+    plain = default_params(sensor, log)._replace(correlation=0.0, caution=0.0)
+
+    def check(**noise):
+        found = compare.agreement(log, config, plain._replace(**noise), seed=1)
+        assert found.same == found.steps
+        assert max(found.pose, found.log_weight, found.landmarks) <= 1e-9
+        return found.pose_filter
+
+    white, correlated = check(), check(correlation=0.3)
+    assert np.abs(correlated - white).max() > 1e-3
+    assert np.abs(check(caution=0.1) - white).max() > 1e-3
+    assert np.abs(check(correlation=0.3, caution=0.1) - correlated).max() > 1e-3

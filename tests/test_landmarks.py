@@ -13,7 +13,9 @@ from jaxslam.baseline import make_model
 from jaxslam.config import SENSORS, Config, default_params
 from jaxslam.sensors import Measurements
 
-PARAMS = default_params()._replace(growth=0.02, position_scale=1.3, mount_x=0.2, mount_yaw=0.1)
+PARAMS = default_params()._replace(
+    growth=0.02, position_scale=1.3, mount_x=0.2, mount_yaw=0.1, caution=0.0
+)
 COV = (0.04, -0.015, 0.02)  # of a position: correlated
 SENSOR_POSE = np.array([0.5, -0.3, 0.8])
 
