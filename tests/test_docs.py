@@ -2,15 +2,24 @@
 
 import ast
 import functools
+import math
 import re
 from pathlib import Path
 
 import pytest
 
-from jaxslam.config import Config, Params
+from jaxslam.config import (
+    ASSOCIATIONS,
+    PROPOSALS,
+    SENSORS,
+    UNITS,
+    Config,
+    Params,
+    default_params,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("docs/equations.md", "docs/algorithm.md", "docs/images.md")
+PAGES = ("docs/equations.md", "docs/algorithm.md", "docs/images.md", "docs/smoothing.md")
 REFERENCE = re.compile(r"`([\w./-]+\.py):([\w.]+)`")
 
 
@@ -90,10 +99,24 @@ def test_what_is_built_has_code_and_a_test_and_what_is_not_says_so():
 
 def test_the_step_explains_every_parameter_and_switch():
     page = text("docs/algorithm.md")
-    switches = [f for f in Config.__dataclass_fields__ if f not in ("block", "proposal")]
+    switches = [f for f in Config.__dataclass_fields__ if f != "block"]
     sizes = {"particles", "landmarks", "measurements", "sensor", "association"}
     words = set(re.findall(r"`(\w+)`", page))
     assert set(Params._fields) - words == set()
     assert set(switches) - sizes - words == set()
-    assert {"position", "range_bearing", "bearing", "known", "maximum_likelihood"} <= words
-    assert len(page.splitlines()) <= 120
+    assert {*SENSORS, *ASSOCIATIONS, *PROPOSALS} <= words
+    assert len(page.splitlines()) <= 160
+
+
+def test_the_defaults_are_the_tables():
+    number = re.compile(r"[-+\d.e]+|-?pi")
+    lines = [line for line in text("docs/defaults.md").splitlines() if line.startswith("| ")]
+    head, *body = [[cell.strip(" `") for cell in line.strip("|").split("|")] for line in lines]
+    table = {row[0]: dict(zip(head, row, strict=True)) for row in body}
+    assert tuple(table) == Params._fields  # in their order
+    assert {name: row["Unit"] for name, row in table.items()} == UNITS
+    for sensor in SENSORS:
+        told = {name: row[sensor] for name, row in table.items()}
+        assert all(map(number.fullmatch, told.values()))
+        values = {k: float(v.replace("pi", str(math.pi))) for k, v in told.items()}
+        assert values == default_params(sensor)._asdict(), sensor
