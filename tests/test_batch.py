@@ -69,7 +69,7 @@ def independent(log, params, variance, weight):
 
 def test_same_solution_as_scipy(log):
     pytest.importorskip("gtsam", reason="GTSAM is not installed: the optional reference")
-    params = default_params("bearing", log)._replace(outlier=0.02)
+    params = default_params("bearing", log)._replace(outlier=0.02, correlation=0.0)
     wrong = log.bearing.copy()
     wrong[5] += 1.0  # one outlier
     log = replace(log, bearing=wrong)

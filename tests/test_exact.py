@@ -47,7 +47,7 @@ def problem():
     cov = np.tile([0.09, 0.02, 0.06], (STEPS, 2, 1))
     measurements = Measurements(value, cov, identity, valid, np.ones(STEPS, bool))
     params = default_params("position")._replace(
-        err_tran=0.4, err_rot=0.0, err_drift=0.0, floor_tran=0.25, floor_rot=0.0
+        err_tran=0.4, err_rot=0.0, err_drift=0.0, floor_tran=0.25, floor_rot=0.0, correlation=0.0
     )
     return odometry, measurements, params
 
@@ -91,7 +91,7 @@ def kalman(odometry, measurements, params):
 
 @pytest.mark.parametrize(
     ("threshold", "proposal"),
-    [(0.0, "prior"), (0.5, "prior"), (1.0, "prior"), (0.0, "informed"), (1.0, "informed")],
+    [(0.0, "prior"), (0.5, "prior"), (0.0, "informed"), (1.0, "informed")],
 )
 def test_evidence_and_means_against_a_joint_kalman_filter(x64, threshold, proposal):
     odometry, measurements, params = problem()

@@ -45,7 +45,8 @@ def seen_from(pose, world):
 
 def params_of(sensor, **changes):
     given = dict(err_tran=0.2, err_rot=0.1, err_drift=0.1, floor_tran=0.02, floor_rot=0.02)
-    return default_params(sensor)._replace(**given | dict(growth=0.0, outlier=0.0) | changes)
+    given |= dict(growth=0.0, outlier=0.0, correlation=0.0)
+    return default_params(sensor)._replace(**given | changes)
 
 
 @pytest.mark.parametrize("points", [0, 1, 4])
