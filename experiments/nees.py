@@ -1,20 +1,15 @@
-"""Is the filter's uncertainty honest? `python experiments/nees.py` (6 minutes, one core).
+"""Are the uncertainties honest? `python experiments/nees.py` (one core; minutes: see the result).
 
-Pose NEES (3 degrees of freedom, the filter's own covariance) over 100 simulated worlds per case.
-The start is known, nothing is aligned, and the filter has the simulation's parameters; driven
-blindly (`closed_loop=False`) but in one case, as only then the worlds are drawn from the filter's
-model exactly: commands that answer to the noise tell of it, which a filter does not use.
-ANEES / 3 should be 1; its 99.9 % band is that of chi-square. Why some cases leave the band:
-- Depletion. With the prior proposal, precise sensors resample often, and of the early paths, on
-  which the map hangs, few survive: over-confident, the later the more. Particles only put it off
-  (step 100 of the precise sensor: 2.3 with 1,000, 1.3 with 8,000, on other worlds). So the cases
-  that stay in the band to step 100 have coarse sensors: chosen for that, on other worlds than here.
-- New landmarks are given the same density everywhere, also where all have been found already. At
-  the density that the simulation declares, a twentieth of the right measurements begin false
-  landmarks; hence the filter's default instead, but in one case.
-- A bearing's EKF diverges for landmarks straight ahead: no parallax, and the robot drives past
-  where it took them to be. A view to the side has none of these.
-Writes experiments/results/nees.json and .md. `--runs`, `--particles`, `--steps` for trials.
+Simulated worlds, drawn from the filter's own model: driven blindly (`closed_loop=False`) but in one
+case, since commands that answer to the noise tell of it, which a filter does not use. The start is
+known, nothing is aligned, and the filter has the simulation's parameters.
+
+Filter: pose NEES (3 degrees of freedom, the filter's own covariance) over 100 worlds a case, the
+same for both proposals. ANEES / 3 should be 1; its 99.9 % band is that of chi-square.
+Refinement: how many true poses and landmarks are inside the 95 % ellipses of the refined path and
+map after 500 steps, and of the filter's. Poses count at every step, as (x, y, heading) and as
+positions; a hidden landmark is the one that most of its measurements are of.
+Writes experiments/results/nees.json and .md. `--runs`, `--particles`, `--only` for trials.
 """
 
 import argparse
@@ -31,13 +26,19 @@ import numpy as np
 from scipy.stats import chi2
 
 from jaxslam import filter as fastslam
+from jaxslam import landmarks as maps
 from jaxslam.config import Config, Params, default_params
+from jaxslam.evaluate import wrap
 from jaxslam.frames import frames
+from jaxslam.refine import refine
 from jaxslam.simulate import planar
+from jaxslam.smoothing import Tree, lineage
 
 RESULTS = Path(__file__).parent / "results"
 SLOTS, MOST = 48, 8  # landmarks in the map, measurements in a frame
-AT = (10, 30, 100, 300, 500)
+AT = (10, 30, 100)
+LONG = 500  # steps after which refinement is judged
+INSIDE = 0.95
 
 
 def degrees(*values):
@@ -46,7 +47,8 @@ def degrees(*values):
 
 def case(name, world, noise, view, sensor="range_bearing", association="known", **other):
     """`noise`: m and degrees. `view`: bearing limits in degrees, range in m. `other`: changes."""
-    settings = dict(steps=100, particles=2000, declared_density=False, closed_loop=False)
+    settings = dict(steps=AT[-1], runs=100, particles=2000, declared_density=False)
+    settings |= dict(closed_loop=False, proposals=("prior", "informed"))
     return settings | other | dict(
         name=name, world=world, sensor=sensor, association=association,
         noise=(noise[0], *degrees(noise[1])), view=(*degrees(*view[:2]), view[2]),
@@ -55,110 +57,271 @@ def case(name, world, noise, view, sensor="range_bearing", association="known", 
 
 ROUND, SIDE = (-180, 180), (-150, -30)
 HIDDEN = dict(association="maximum_likelihood")
-CASES = (
-    case("range, bearing; known", "grid", (0.2, 4), (*ROUND, 5.0), steps=500),
-    case("the same, steered by truth", "grid", (0.2, 4), (*ROUND, 5.0), closed_loop=True),
-    case("range, bearing; hidden", "grid", (0.2, 3), (*ROUND, 4.0), particles=4000, **HIDDEN),
+FILTERED = (
+    case("bearing; known", "room", (0.2, 4), (*ROUND, 8.0), "bearing"),
     case("bearing, to the side; known", "room", (0.2, 4), (*SIDE, 8.0), "bearing"),
+    case("range, bearing; known", "grid", (0.2, 4), (*ROUND, 5.0)),
+    case("range, bearing; hidden", "grid", (0.2, 3), (*ROUND, 4.0), particles=4000, **HIDDEN),
+    case("position; known", "grid", (0.2, 4), (*ROUND, 5.0), "position"),
+    case("range, bearing, steered by truth; known", "grid", (0.2, 4), (*ROUND, 5.0),
+         closed_loop=True, proposals=("prior",)),
     case("limits: precise sensor; known", "field", (0.1, 2), (*ROUND, 8.0), particles=1000),
     case("limits: new landmarks at the declared density; hidden", "grid", (0.2, 3), (*ROUND, 4.0),
-         declared_density=True, **HIDDEN),
-    case("limits: bearing, all round; known", "room", (0.2, 4), (*ROUND, 8.0), "bearing"),
+         declared_density=True, proposals=("prior",), **HIDDEN),
+)  # fmt: skip
+REFINED = (
+    case("bearing; known", "room", (0.2, 4), (*ROUND, 8.0), "bearing",
+         steps=LONG, particles=1000, proposals=("informed",)),
+    case("range, bearing; hidden", "grid", (0.2, 3), (*ROUND, 4.0),
+         steps=LONG, particles=1000, proposals=("informed",), **HIDDEN),
 )  # fmt: skip
 
 
-def kept(info):
-    return info.estimate.mean, info.estimate.cov, info.resampled, info.new
-
-
-def one_run(given, config, seed):
-    """NEES [T] of one world; how often it resampled, and landmarks begun per true one seen."""
+def simulated(given, seed):
+    """The case's log of one seed, its frames, and the filter's parameters."""
     log = planar(
         given["world"], seed, length_m=0.1 * (given["steps"] + 0.5), landmarks=40,
         sigma_range=given["noise"][0], sigma_bearing=given["noise"][1], view=given["view"],
         max_per_frame=MOST, closed_loop=given["closed_loop"],
     )  # fmt: skip
-    params = default_params(config.sensor, log)
+    params = default_params(given["sensor"], log)._replace(correlation=0.0, caution=0.0)
     if not given["declared_density"]:
         params = params._replace(density_new=default_params().density_new)
-    data = frames(log, config.sensor, MOST, params, config.association == "known")
-    origin = np.array([*log.start_pose[:2], 0.0])
-    key = jax.random.key(seed)
+    return log, frames(log, given["sensor"], MOST, params, given["association"] == "known"), params
+
+
+def kept(info):
+    return info.estimate, info.resampled, info.new
+
+
+def kept_with_past(info):
+    return *kept(info), info.pose, info.birth, info.ancestors
+
+
+def filtered(log, data, params, config, seed, keep):
+    """The state at the end and what was kept of every step; the origin is the start's place."""
+    key, origin = jax.random.key(seed), np.array([*log.start_pose[:2], 0.0])
     state = fastslam.init(config, key, log.start_pose - origin, log.start_cov)
     odometry, measurements = jax.tree.map(jnp.asarray, (data.odometry, data.measurements))
     numbers = jax.tree.map(jnp.asarray, Params(*map(float, params)))
-    _, trace = fastslam.run(key, state, odometry, measurements, numbers, config, kept)
-    mean, cov, resampled, new = (np.asarray(part, float) for part in trace)
-    error = mean + origin - log.truth.pose
-    error[:, 2] = (error[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    state, trace = fastslam.run(key, state, odometry, measurements, numbers, config, keep)
+    return state, jax.tree.map(np.asarray, trace), origin
+
+
+def squares(error, cov):
+    """NEES [n] of errors [n, d] with covariances [n, d, d]."""
     # A micrometre more: all particles may have become one.
-    scaled = np.linalg.solve(cov + 1e-12 * np.eye(3), error[..., None])[..., 0]
+    cov = np.asarray(cov, float) + 1e-12 * np.eye(error.shape[1])
+    return np.sum(error * np.linalg.solve(cov, error[..., None])[..., 0], 1)
+
+
+def pose_squares(pose, cov, log):
+    """NEES [T] of poses, and of their positions alone."""
+    error = pose - log.truth.pose
+    error[:, 2] = wrap(error[:, 2])
+    return squares(error, cov), squares(error[:, :2], cov[:, :2, :2])
+
+
+def one_filtered(given, config, seed):
+    """NEES [T] of one world; how often it resampled, and landmarks begun per true one seen."""
+    log, data, params = simulated(given, seed)
+    _, (estimate, resampled, new), origin = filtered(log, data, params, config, seed, kept)
     seen = len(np.unique(log.truth.identity[log.truth.identity >= 0]))
-    return np.sum(error * scaled, 1), resampled.mean(), new.sum() / seen
+    whole, _ = pose_squares(estimate.mean + origin, estimate.cov, log)
+    return whole, resampled.mean(), new.sum() / seen
 
 
-def measure(given, runs):
-    """A case's row: ANEES / 3 at the steps `AT`, with the least and greatest allowed."""
-    config = Config(
-        sensor=given["sensor"], association=given["association"],
+def config_of(given, proposal):
+    return Config(
+        sensor=given["sensor"], association=given["association"], proposal=proposal,
         particles=given["particles"], landmarks=SLOTS, measurements=MOST,
     )  # fmt: skip
-    begin = time.perf_counter()
-    nees, resampled, born = zip(
-        *(one_run(given, config, seed) for seed in range(runs)), strict=True
-    )
+
+
+def measure(given, proposal):
+    """A filter row: ANEES / 3 at the steps `AT`, with the least and greatest allowed."""
+    config, runs, begin = config_of(given, proposal), given["runs"], time.perf_counter()
+    found = [one_filtered(given, config, seed) for seed in range(runs)]
+    nees, resampled, born = zip(*found, strict=True)
+    nees = np.array(nees) / 3
     band = chi2.ppf([0.0005, 0.9995], 3 * runs) / (3 * runs)
-    value = {t: float(np.mean([run[t - 1] for run in nees]) / 3) for t in AT if t <= len(nees[0])}
-    middle = {t: float(np.median([run[t - 1] for run in nees]) / chi2.ppf(0.5, 3)) for t in value}
     return given | dict(
-        runs=runs, band=band.tolist(), anees_over_3=value, median_over_its_own=middle,
-        resampled=float(np.mean(resampled)), landmarks_per_true=float(np.mean(born)),
+        proposal=proposal, band=band.tolist(), resampled=float(np.mean(resampled)),
+        anees_over_3={t: float(nees[:, t - 1].mean()) for t in AT},
+        median_over_its_own={
+            t: float(np.median(nees[:, t - 1]) * 3 / chi2.ppf(0.5, 3)) for t in AT
+        },
+        greatest_of_one_world={t: float(nees[:, t - 1].max()) for t in AT},
+        landmarks_per_true=float(np.mean(born)), seconds=time.perf_counter() - begin,
+    )  # fmt: skip
+
+
+def truth_of(match, data, log, ids, count):
+    """The true landmark [L] that most measurements of each label are of; -1: clutter."""
+    place = np.arange(match.size).reshape(match.shape)
+    label = np.where(match == -1, place, match)
+    who = np.where(data.row >= 0, log.truth.identity[data.row], -1)
+    best = []
+    for each in ids:
+        votes = np.bincount(who[label == each] + 1, minlength=count + 1)
+        best.append(votes.argmax() - 1)
+    return np.array(best, int)
+
+
+def map_squares(mean, cov, match, ids, data, log):
+    """NEES [L] of the landmarks of a map that are of a true one; how many true ones it lacks."""
+    marks = log.truth.landmarks
+    of = truth_of(match, data, log, ids, len(marks))
+    real = of >= 0
+    xx, xy, yy = np.asarray(cov, float)[real].T
+    full = np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2)
+    seen = np.unique(log.truth.identity[data.row[data.row >= 0]])
+    missed = np.setdiff1d(seen[seen >= 0], of)
+    return squares(mean[real] - marks[of[real]], full), len(missed), int(np.sum(~real))
+
+
+def one_refined(given, config, seed):
+    """NEES of poses, positions and landmarks, by estimate, of one world; and seconds."""
+    begin = time.perf_counter()
+    log, data, params = simulated(given, seed)
+    state, trace, origin = filtered(log, data, params, config, seed, kept_with_past)
+    estimate, _, _, pose, birth, ancestors = trace
+    tree = Tree()
+    tree.extend(pose, birth, ancestors)
+    best = int(np.argmax(ancestors[-1] == estimate.best[-1]))
+    past = lineage(tree, best)
+    middle = time.perf_counter()
+    found = refine(
+        data, past.pose + origin, past.birth, log.start_pose, log.start_cov, params,
+        given["sensor"], config.association == "known",
+    )  # fmt: skip
+    end = time.perf_counter()
+    numbers = jax.tree.map(jnp.asarray, Params(*map(float, params)))
+    table = maps.summarise(state.landmarks, jnp.exp(state.log_weight), best, numbers, config)
+    table = jax.tree.map(np.asarray, table)
+    keep = np.flatnonzero(table.kept)
+    mean, cov = table.mean[:, keep].T + origin[:2], table.cov[:, keep].T
+    marks, *lost = map_squares(mean, cov, past.birth, table.birth[keep], data, log)
+    filter_ = *pose_squares(estimate.mean + origin, estimate.cov, log), marks, *lost
+    marks, *lost = map_squares(found.mean, found.landmark_cov, found.match, found.id, data, log)
+    refined_ = *pose_squares(found.pose, found.cov, log), marks, *lost
+    return filter_, refined_, (middle - begin, end - middle), found.converged
+
+
+def shares(found):
+    """Of every world's NEES of poses, positions, landmarks: shares inside, with their standard
+    errors over the worlds; ANEES over dimensions at the end; landmarks missed and of nothing."""
+    row = {}
+    for i, (name, size) in enumerate((("poses", 3), ("positions", 2), ("landmarks", 2))):
+        inside = [np.mean(world[i] < chi2.ppf(INSIDE, size)) for world in found]
+        error = np.std(inside, ddof=1) / np.sqrt(len(inside)) if len(inside) > 1 else np.nan
+        row[name] = float(np.mean(inside)), float(error)
+    row["anees_over_3"] = float(np.mean([world[0][-1] for world in found]) / 3)
+    row["landmark_anees_over_2"] = float(np.mean(np.concatenate([w[2] for w in found])) / 2)
+    row["missed"], row["of_nothing"] = (float(np.mean([w[i] for w in found])) for i in (3, 4))
+    return row
+
+
+def measure_refined(given, proposal):
+    """A refinement row."""
+    config, begin = config_of(given, proposal), time.perf_counter()
+    found = [one_refined(given, config, seed) for seed in range(given["runs"])]
+    filter_, refined_, seconds, converged = zip(*found, strict=True)
+    return given | dict(
+        proposal=proposal, filter=shares(filter_), refined=shares(refined_),
+        median_seconds=np.median(seconds, 0).tolist(), converged=float(np.mean(converged)),
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
 
 
-def line(row):
-    low, high = row["band"]
-
-    def cell(t):
-        if t not in row["anees_over_3"]:
-            return ""
-        value = row["anees_over_3"][t]
-        return f"{value:.3g} {'in' if low <= value <= high else '**out**'}"
-
+def setting(row):
     (range_, bearing), reach = row["noise"], row["view"][2]
+    noise = f"{np.rad2deg(bearing):.0f}°"
+    noise = noise if row["sensor"] == "bearing" else f"{range_} m, {noise}"
+    return f"{row['world']}, {noise}, {reach:.0f} m | {row['particles']} | {row['proposal']}"
+
+
+FILTER_HEAD = (
+    "| sensor; identities | world, noise, sight | particles | proposal | "
+    + " | ".join(f"step {t}" for t in AT)
+    + " | worst world | steps resampled | landmarks begun per true one |\n|---|---|--:|---|"
+    + "--:|" * (len(AT) + 3)
+)
+
+
+def filter_line(row):
+    low, high = row["band"]
+    cells = [
+        f"{value:.3g} {'in' if low <= value <= high else '**out**'}"
+        for value in row["anees_over_3"].values()
+    ]
     return (
-        f"| {row['name']} | {row['world']}, {range_} m, {np.rad2deg(bearing):.0f}°, {reach:.0f} m"
-        f" | {row['particles']} | " + " | ".join(map(cell, AT)) + f" | {row['resampled']:.0%}"
+        f"| {row['name']} | {setting(row)} | {' | '.join(cells)}"
+        f" | {max(row['greatest_of_one_world'].values()):.1f} | {row['resampled']:.0%}"
         f" | {row['landmarks_per_true']:.2f} |"
     )
 
 
+REFINED_HEAD = (
+    "| sensor; identities | world, noise, sight | particles | proposal | runs | estimate | poses"
+    " | positions | landmarks | ANEES / 3 at the end | of landmarks, / 2 | landmarks missed"
+    " | of nothing |\n|---|---|--:|---|--:|---|" + "--:|" * 7
+)
+
+
+def refined_lines(row):
+    for name in ("filter", "refined"):
+        one = row[name]
+        cells = [
+            f"{share:.1%} ± {error:.1%}"
+            for share, error in (one[kind] for kind in ("poses", "positions", "landmarks"))
+        ]
+        yield (
+            f"| {row['name']} | {setting(row)} | {row['runs']} | {name} | {' | '.join(cells)}"
+            f" | {one['anees_over_3']:.3g} | {one['landmark_anees_over_2']:.3g}"
+            f" | {one['missed']:.2f} | {one['of_nothing']:.2f} |"
+        )
+
+
+def tables(changes, only):
+    """The lines of both tables, printed as they come, and their rows."""
+    runs = changes.get("runs", 100)
+    low, high = chi2.ppf([0.0005, 0.9995], 3 * runs) / (3 * runs)
+    lines, rows = [], []
+
+    def put(text, seconds=None):
+        lines.append(text)
+        print(text, "" if seconds is None else f"{seconds:.0f} s", flush=True)
+
+    def chosen(cases):
+        for each in cases:
+            if only in each["name"]:
+                yield from ((each | changes, proposal) for proposal in each["proposals"])
+
+    put(f"Filter: ANEES / 3 of the pose, {runs} runs, 99.9 % band [{low:.3f}, {high:.3f}].\n")
+    put(FILTER_HEAD)
+    for each, proposal in chosen(FILTERED):
+        rows.append(measure(each, proposal))
+        put(filter_line(rows[-1]), rows[-1]["seconds"])
+    put(f"\nRefinement: truth inside the {INSIDE:.0%} ellipses, {LONG} steps (± standard error).\n")
+    put(REFINED_HEAD)
+    for each, proposal in chosen(REFINED):
+        rows.append(measure_refined(each, proposal))
+        put("\n".join(refined_lines(rows[-1])), rows[-1]["seconds"])
+    return lines, rows
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--runs", type=int, help="instead of each case's own")
     parser.add_argument("--particles", type=int, help="instead of each case's own")
-    parser.add_argument(
-        "--steps", type=int, help="instead of each case's own; 500 at most is shown"
-    )
+    parser.add_argument("--only", default="", help="cases with this in their names")
     given = parser.parse_args()
-    changes = {k: getattr(given, k) for k in ("particles", "steps") if getattr(given, k)}
-    low, high = chi2.ppf([0.0005, 0.9995], 3 * given.runs) / (3 * given.runs)
-    lines = [
-        f"ANEES / 3 of the pose, {given.runs} runs, 99.9 % band [{low:.3f}, {high:.3f}].",
-        "",
-        "| sensor; identities | world, noise, sight | particles | "
-        + " | ".join(f"step {t}" for t in AT)
-        + " | steps resampled | landmarks begun per true one |",
-        "|---|---|--:|" + "--:|" * (len(AT) + 2),
-    ]
-    print(*lines, sep="\n", flush=True)
-    rows = []
-    for each in CASES:
-        rows.append(measure(each | changes, given.runs))
-        lines.append(line(rows[-1]))
-        print(lines[-1], f"{rows[-1]['seconds']:.0f} s", flush=True)
-    if given.runs == 100 and not changes:
+    changes = {k: getattr(given, k) for k in ("particles", "runs") if getattr(given, k)}
+    lines, rows = tables(changes, given.only)
+    if not changes and not given.only:
+        minutes = sum(row["seconds"] for row in rows) / 60
+        lines.append(f"\n{minutes:.0f} minutes of one core that it shared.")
         RESULTS.mkdir(exist_ok=True)
         (RESULTS / "nees.md").write_text("\n".join(lines) + "\n")
         (RESULTS / "nees.json").write_text(json.dumps(rows, indent=1) + "\n")
