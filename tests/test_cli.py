@@ -105,6 +105,15 @@ def test_simulate_run_again_and_moved_log(at, call, refuse):
     assert "path, filter" in out
 
 
+def test_informed_and_drawn(log, call):
+    run = "run", log, *MANY, "--association", "sampled", "--proposal", "informed"
+    code, out, _ = call(*run, "--out", "result")
+    assert code == 0
+    assert "path, filter" in out
+    config = report.load("result").config
+    assert (config.association, config.proposal) == ("sampled", "informed")
+
+
 def test_overwriting_keeps_the_old_folder_until_the_new_one_is_there(log, call):
     run = "run", log, *MANY, "--out", "result"
     assert call(*run)[0] == 0

@@ -6,7 +6,15 @@ import math
 import numpy as np
 import pytest
 
-from jaxslam.config import ASSOCIATIONS, SENSORS, UNITS, Config, Params, default_params
+from jaxslam.config import (
+    ASSOCIATIONS,
+    PROPOSALS,
+    SENSORS,
+    UNITS,
+    Config,
+    Params,
+    default_params,
+)
 from jaxslam.log import Log
 
 
@@ -93,7 +101,7 @@ def test_thresholds_of_never_sometimes_and_always_are_allowed(value):
 
 @pytest.mark.parametrize(
     "name, allowed",
-    [("sensor", SENSORS), ("association", ASSOCIATIONS), ("proposal", ("prior",))],
+    [("sensor", SENSORS), ("association", ASSOCIATIONS), ("proposal", PROPOSALS)],
 )
 def test_names_are_checked_and_the_allowed_ones_listed(name, allowed):
     for value in allowed:

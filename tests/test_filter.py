@@ -8,13 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxslam import association
 from jaxslam import filter as fastslam
 from jaxslam.config import SENSORS, Config, default_params
+from jaxslam.evaluate import ate
 from jaxslam.frames import frames
 from jaxslam.runner import config_for, run
 from jaxslam.simulate import planar
 
 STEPS, PARTICLES = 40, 16
+DRAWN = dict(proposal="informed", association="sampled")
 
 
 @pytest.fixture(scope="module")
@@ -55,39 +58,17 @@ def drive(config, params, data, chance, start=(0.0, 0.0, 0.0)):
     return _scan(state, chance, data, params, config)
 
 
-@pytest.mark.parametrize("sensor", SENSORS)
-def test_rotating_and_translating_the_world_moves_everything_along(x64, log, sensor):
-    config, params, data = setup(log, sensor)
-    chance = chances(config)
-    angle, shift = 2.1, np.array([700.0, -400.0])
-    state, info = drive(config, params, data, chance)
-    moved, moved_info = drive(config, params, data, chance, (*shift, angle))
-    assert info.resampled.sum() > 3
-    np.testing.assert_array_equal(info.ancestors, moved_info.ancestors)
-    np.testing.assert_array_equal(info.match, moved_info.match)
-    np.testing.assert_allclose(info.log_evidence, moved_info.log_evidence, atol=1e-8)
-    rotate = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    expected = rotate @ np.asarray(state.pose[:2]) + shift[:, None]
-    np.testing.assert_allclose(moved.pose[:2], expected, atol=1e-9)
-    turned = np.exp(1j * (np.asarray(state.pose[2]) + angle))
-    np.testing.assert_allclose(np.exp(1j * np.asarray(moved.pose[2])), turned, atol=1e-11)
-    used = np.asarray(state.landmarks.count > 0)
+def turned_and_shifted(state, sensor, angle, shift):
+    """Poses [3, N] and landmarks' means [2, M, N] of the state in a turned and shifted world."""
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    pose, mean = np.array(state.pose), np.array(state.landmarks.mean)
+    pose = np.vstack([turn @ pose[:2] + shift[:, None], pose[2] + angle])
     if sensor == "bearing":
-        off = np.asarray(moved.landmarks.mean - state.landmarks.mean)[:, used]
-        np.testing.assert_allclose(np.exp(1j * (off[0] - angle)), 1, atol=1e-9)
-        np.testing.assert_allclose(off[1], 0, atol=1e-9)
-    else:
-        points = np.einsum("ij,jmn->imn", rotate, state.landmarks.mean) + shift[:, None, None]
-        np.testing.assert_allclose(
-            np.asarray(moved.landmarks.mean)[:, used], points[:, used], atol=1e-9
-        )
+        return pose, mean + np.array([angle, 0])[:, None, None]
+    return pose, np.einsum("ij,jmn->imn", turn, mean) + shift[:, None, None]
 
 
-@pytest.mark.parametrize("sensor", SENSORS)
-def test_mirroring_the_world_mirrors_the_answer(x64, log, sensor):
-    config, params, data = setup(log, sensor)
-    chance = chances(config)
-    state, info = drive(config, params, data, chance)
+def mirrored(params, data, chance, sensor):
     flip = jnp.array([1.0, -1.0, -1.0])[None, :, None]
     odometry, measurements = data
     odometry = odometry._replace(dy=-odometry.dy, dtheta=-odometry.dtheta)
@@ -101,17 +82,41 @@ def test_mirroring_the_world_mirrors_the_answer(x64, log, sensor):
         view_min=-params.view_max,
         view_max=-params.view_min,
     )
-    mirrored, mirrored_info = drive(
-        config, params, (odometry, measurements), chance._replace(normals=chance.normals * flip)
-    )
-    np.testing.assert_array_equal(info.ancestors, mirrored_info.ancestors)
-    np.testing.assert_array_equal(info.match, mirrored_info.match)
-    np.testing.assert_allclose(mirrored.pose, state.pose * flip[0], atol=1e-10)
+    return params, (odometry, measurements), chance._replace(normals=chance.normals * flip)
 
 
-@pytest.mark.parametrize("association", ["known", "maximum_likelihood"])
-def test_the_order_within_a_frame_changes_nothing(x64, log, association):
-    config, params, data = setup(log, association=association)
+@pytest.mark.parametrize("settings", [{}, DRAWN], ids=["likeliest", "drawn"])
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_a_moved_or_mirrored_world_gives_the_answer_moved_or_mirrored(x64, log, sensor, settings):
+    config, params, data = setup(log, sensor, **settings)
+    chance = chances(config)
+    state, info = drive(config, params, data, chance)
+    assert info.resampled.sum() > 3
+    assert (info.log_choice.min() < -0.1) == (settings == DRAWN)
+
+    angle, shift = 2.1, np.array([700.0, -400.0])
+    moved, moved_info = drive(config, params, data, chance, (*shift, angle))
+    np.testing.assert_array_equal(info.ancestors, moved_info.ancestors)
+    np.testing.assert_array_equal(info.match, moved_info.match)
+    np.testing.assert_allclose(info.log_evidence, moved_info.log_evidence, atol=1e-8)
+    pose, mean = turned_and_shifted(state, sensor, angle, shift)
+    np.testing.assert_allclose(moved.pose[:2], pose[:2], atol=1e-9)
+    np.testing.assert_allclose(np.exp(1j * np.asarray(moved.pose[2] - pose[2])), 1, atol=1e-11)
+    used = np.asarray(state.landmarks.count > 0)
+    off = np.asarray(moved.landmarks.mean - mean)[:, used]
+    if sensor == "bearing":
+        off[0] = np.abs(np.exp(1j * off[0]) - 1)
+    np.testing.assert_allclose(off, 0, atol=1e-9)
+
+    flipped, flipped_info = drive(config, *mirrored(params, data, chance, sensor))
+    np.testing.assert_array_equal(info.ancestors, flipped_info.ancestors)
+    np.testing.assert_array_equal(info.match, flipped_info.match)
+    np.testing.assert_allclose(flipped.pose, state.pose * [[1], [-1], [-1]], atol=1e-10)
+
+
+@pytest.mark.parametrize("kind", ["known", "maximum_likelihood"])
+def test_the_order_within_a_frame_changes_nothing(x64, log, kind):
+    config, params, data = setup(log, association=kind)
     chance = chances(config)
     state, info = drive(config, params, data, chance)
     order = np.random.default_rng(0).permutation(config.measurements)
@@ -123,6 +128,7 @@ def test_the_order_within_a_frame_changes_nothing(x64, log, association):
         }
     )
     other, other_info = drive(config, params, (odometry, shuffled), chance)
+    np.testing.assert_array_equal(info.log_choice, 0)
     np.testing.assert_array_equal(info.ancestors, other_info.ancestors)
     np.testing.assert_allclose(info.log_evidence, other_info.log_evidence, atol=1e-9)
     np.testing.assert_allclose(state.pose, other.pose, atol=1e-12)
@@ -134,20 +140,22 @@ def test_the_order_within_a_frame_changes_nothing(x64, log, association):
         np.testing.assert_allclose(*maps, atol=1e-9)
 
 
-@pytest.mark.parametrize("block", [1, 1000])
-def test_the_block_changes_no_result(x64, log, block):
-    config, params, data = setup(log)
+@pytest.mark.parametrize(("block", "settings"), [(1, {}), (1000, DRAWN)])
+def test_the_block_changes_no_result(x64, log, block, settings):
+    config, params, data = setup(log, **settings)
     chance = chances(config)
-    state, _ = drive(config, params, data, chance)
-    other, _ = drive(dataclasses.replace(config, block=block), params, data, chance)
+    state, info = drive(config, params, data, chance)
+    other, other_info = drive(dataclasses.replace(config, block=block), params, data, chance)
+    np.testing.assert_array_equal(info.match, other_info.match)
+    np.testing.assert_allclose(info.log_choice, other_info.log_choice, atol=1e-9)
     np.testing.assert_allclose(state.pose, other.pose, atol=1e-12)
     np.testing.assert_array_equal(state.landmarks.count, other.landmarks.count)
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
-@pytest.mark.parametrize("association", ["known", "maximum_likelihood"])
-def test_a_step_keeps_shapes_and_types(log, sensor, association):
-    config, params, data = setup(log, sensor, association=association)
+@pytest.mark.parametrize("settings", [{}, {"association": "known"}, DRAWN])
+def test_a_step_keeps_shapes_and_types(log, sensor, settings):
+    config, params, data = setup(log, sensor, **settings)
     key = jax.random.key(0)
     state = fastslam.init(config, key)
     frame = jax.tree.map(lambda leaf: leaf[0], data)
@@ -175,7 +183,7 @@ def test_a_step_compiles_once_for_a_configuration(log):
 
 def test_a_full_map_is_reported(log):
     config = config_for(log, particles=20, landmarks=3)
-    result = run(log, config)
+    result = run(log, config, refine=False)
     assert result.overflow.sum() > 1
     assert any("map was full" in line for line in result.flags)
 
@@ -219,6 +227,24 @@ def test_a_frame_without_a_look_only_moves(log):
     assert not np.allclose(state.pose, after.pose)
 
 
+def test_without_a_look_informed_particles_move_as_the_priors(x64, log):
+    """They draw from the motion model, not its mean: with the same normals to the same poses."""
+    poses = []
+    for settings in ({}, DRAWN):
+        config, params, data = setup(log, **settings)
+        odometry, measurements = jax.tree.map(lambda leaf: leaf[5], data)
+        blind = measurements._replace(active=jnp.array(False))
+        chance = jax.tree.map(lambda leaf: leaf[0], chances(config, 1))
+        state = fastslam.init(config, jax.random.key(0), (0.3, -0.2, 0.5))
+        with jax.disable_jit():  # one branch of two, uncompiled
+            _, info = fastslam.advance(chance, state, odometry, blind, params, config)
+        assert (info.match == association.PADDING).all()
+        assert (info.log_choice == 0).all()
+        poses.append(info.pose)
+    np.testing.assert_allclose(*poses, atol=1e-12)
+    assert np.ptp(poses[0], axis=1).min() > 1e-4
+
+
 def test_forward_gradients_flow_and_match_finite_differences(x64, log):
     """Along one fixed history (no resampling), by parameters that move everything smoothly."""
     config, params, data = setup(log, association="known", resample_threshold=0.0, clutter=False)
@@ -250,10 +276,13 @@ def test_start_poses_have_the_covariance_asked_for(x64):
     np.testing.assert_allclose(np.cov(state.pose), flat, atol=2e-3)
 
 
-def test_results_do_not_depend_on_the_chunks(log, monkeypatch):
-    config = config_for(log, particles=20, landmarks=30)
-    whole = run(log, config)
+def test_drawn_results_are_sound_and_do_not_depend_on_the_chunks(log, monkeypatch):
+    config = config_for(log, particles=20, landmarks=30, **DRAWN)
+    whole = run(log, config, refine=False)
+    assert whole.flags == []
+    assert whole.forgotten.sum() > 0
+    assert ate(whole.pose, log.truth.pose, align=False)[0] < 0.5
     monkeypatch.setattr("jaxslam.runner.CHUNK", 7)
-    parts = run(log, config)
+    parts = run(log, config, refine=False)
     np.testing.assert_allclose(whole.pose, parts.pose, atol=1e-6)
     np.testing.assert_array_equal(whole.match, parts.match)
