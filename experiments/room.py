@@ -193,9 +193,10 @@ def limits(rows):
     cases = list(dict.fromkeys(name.split(",")[0] for name, _ in rows))
     for case in cases:
         some = [found for name, found in rows if name.split(",")[0] == case]
-        path, world = (max(found[f"{what}_refined_m"] for found in some)
+        # max() of arrays, unlike Python's, hands on a NaN, which holds no limit.
+        path, world = (np.max([found[f"{what}_refined_m"] for found in some])
                        for what in ("path", "landmarks"))  # fmt: skip
-        state = "held" if max(path, world) <= LIMIT else "broken"
+        state = "held" if path <= LIMIT and world <= LIMIT else "broken"
         if case == HIDDEN:
             state += " (not claimed)"
         lines.append(f"| {case} | {len(some)} | {path:.3f} | {world:.3f} | {LIMIT} | {state} |")
