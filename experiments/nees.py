@@ -315,11 +315,11 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, help="instead of each case's own; nothing is written")
     parser.add_argument("--particles", type=int, help="the same")
-    parser.add_argument("--only", default="", help="cases with this in their names")
+    parser.add_argument("--only", default="", help="cases whose names begin so")
     given = parser.parse_args()
     changes = {k: getattr(given, k) for k in ("particles", "runs") if getattr(given, k)}
     for each in FILTERED + REFINED:
-        for proposal in each["proposals"] if given.only in each["name"] else ():
+        for proposal in each["proposals"] if each["name"].startswith(given.only) else ():
             long = each["steps"] == LONG
             row = (measure_refined if long else measure)(each | changes, proposal)
             for text in refined_lines(row) if long else [filter_line(row)]:
