@@ -387,7 +387,9 @@ def test_errors_that_stay_alike_count_less():
         params = params_of("range_bearing", correlation=correlation, outlier=0.01)
         with jax.enable_x64(True):
             given, _ = bundle.problem(data, np.zeros(3), None, params, "range_bearing")
-        expected = np.tanh(odometry.distance / 2) if correlation else np.ones(6)
+        # A radian counts as a tenth of a metre.
+        travel = odometry.distance + 0.1 * odometry.turn
+        expected = np.tanh(travel / 2) if correlation else np.ones(6)
         np.testing.assert_allclose(given.share, expected[given.frame], rtol=1e-6)
         got = refine(
             data, pose, np.full((6, 3), -1), np.zeros(3), None, params, "range_bearing", True
