@@ -5,10 +5,10 @@
     python experiments/real_logs.py --particles 1000
 
 Default configuration and parameters of the sensor, with what the log declares; MRCLAM's robots also
-have the gains in experiments/params/, found from their logs. Path errors are root mean squares
-after aligning (SE(2), no scale), the landmarks' follow the path's alignment; nothing aligned is in
-the .json. Simulated rooms: `worlds`. GTSAM's solution is from bearings and known identities
-(`batch`), whatever ours used; without GTSAM its column is left out. MRCLAM may not be
+have the gains in experiments/params/, found from odometry against truth. Path errors are root mean
+squares after aligning (SE(2), no scale), the landmarks' follow the path's alignment; nothing
+aligned is in the .json. Simulated rooms: `worlds`. GTSAM's solution is from bearings and known
+identities (`batch`), whatever ours used; without GTSAM its column is left out. MRCLAM may not be
 redistributed: read from ../shared/data/mrclam, or left out. Writes experiments/results/real_logs.md
 and .json; every seed must hold the limits.
 """
