@@ -1,8 +1,10 @@
-"""FastSLAM 1.0 with many measurements per step (paper, section III-D), vectorised.
+"""FastSLAM with many measurements per step (paper, section III-D), vectorised.
 
 Each of N particles carries a pose and M landmark EKFs (eq. 6). A step moves the particles (eqs. 2
-and 4), associates, weighs and updates with every measurement of the frame (eqs. 3 and 5), and
-resamples. All arrays have fixed sizes and the particles last; `step` and `run` are pure and jitted.
+and 4), from the motion alone (FastSLAM 1.0, as in the paper) or informed by the measurements (2.0);
+associates, weighs and updates with every measurement of the frame (eqs. 3 and 5: `observation`);
+and resamples. All arrays have fixed sizes and the particles last; `step` and `run` are pure and
+jitted.
 """
 
 from functools import partial
