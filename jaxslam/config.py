@@ -17,6 +17,8 @@ PROPOSALS = ("prior", "informed")
 class Config:
     """Static settings of the filter; one compilation per distinct `Config`.
 
+    `proposal`: poses are drawn from the motion alone (`prior`, FastSLAM 1.0) or from motion times
+    measurements (`informed`, 2.0). `association`: see `association`.
     `resample_threshold` t: resample when ESS < t * particles (0: never, 1 or more: every frame).
     `exclusive`: two measurements of one frame never share a landmark. `clutter`: a measurement may
     come from nothing. `forgetting`: landmarks carry an existence log-odds and are freed below zero
