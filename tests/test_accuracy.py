@@ -1,6 +1,6 @@
 """The accuracy the README claims on the bundled log, one seed of each sensor.
 
-All seeds: experiments/accuracy.py.
+All seeds: experiments/real_logs.py.
 """
 
 import dataclasses
@@ -21,10 +21,12 @@ def log():
 def test_the_room_is_mapped_with_identities_hidden(log, sensor):
     result = run(log, config_for(log, sensor, particles=1000), seed=0)
     found = errors(result)
-    assert found["ate_filtered_rmse_m"] <= 0.15
-    assert found["landmark_filtered_rmse_m"] <= 0.10
-    assert found["landmarks_matched"] == 17
-    assert found["landmarks_spurious"] <= 2
+    assert found["ate_filtered_rmse_m"] <= 0.08
+    assert found["landmark_filtered_rmse_m"] <= 0.06
+    assert found["ate_refined_rmse_m"] <= 0.06
+    assert found["landmark_refined_rmse_m"] <= 0.06
+    assert found["landmarks_refined_matched"] == 17
+    assert found["landmarks_refined_spurious"] <= 1
     assert found["association_accuracy"] > 0.99
     assert found["dead_reckoning_end_m"] == pytest.approx(4.6, abs=0.1)
     assert result.flags == []
@@ -32,10 +34,11 @@ def test_the_room_is_mapped_with_identities_hidden(log, sensor):
 
 @pytest.mark.slow
 def test_the_room_is_mapped_from_bearings_when_identities_are_known(log):
-    found = errors(run(log, config_for(log, "bearing", "known", particles=2000), seed=0))
-    assert found["ate_filtered_rmse_m"] <= 0.40
-    assert found["landmark_filtered_rmse_m"] <= 0.35
-    assert found["landmarks_matched"] == 17
+    found = errors(run(log, config_for(log, "bearing", "known", particles=1000), seed=0))
+    assert found["ate_filtered_rmse_m"] <= 0.20
+    assert found["ate_refined_rmse_m"] <= 0.065
+    assert found["landmark_refined_rmse_m"] <= 0.08
+    assert found["landmarks_refined_matched"] == 17
 
 
 def test_a_minute_of_it_beats_dead_reckoning_by_far(log):
