@@ -39,9 +39,11 @@ def test_hidden_landmarks_count_within_the_gate_and_known_ones_wherever_they_are
     assert hidden["path_refined_aligned_m"] == pytest.approx(0, abs=1e-6)
     assert hidden["landmarks_refined_m"] <= 0.02 + 1e-9
     assert hidden["spurious_refined"] == 1
+    assert hidden["landmarks_refined_identified_m"] is None
     known = room._of_stage("refined", path, _map(mean, np.arange(len(mean))), true, SEED, None)
     far = np.append(np.full(len(mean) - 1, 0.02), 29.98)
-    assert known["landmarks_refined_m"] == pytest.approx(np.sqrt(np.mean(far**2)))
+    assert known["landmarks_refined_m"] == hidden["landmarks_refined_m"]
+    assert known["landmarks_refined_identified_m"] == pytest.approx(np.sqrt(np.mean(far**2)))
     assert known["landmark_refined_max_m"] == pytest.approx(29.98)
 
 
