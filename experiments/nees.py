@@ -58,12 +58,11 @@ def case(name, world, noise, view, sensor="range_bearing", association="known", 
 ROUND, SIDE = (-180, 180), (-150, -30)
 HIDDEN = dict(association="maximum_likelihood")
 FILTERED = (
+    case("coarse bearing; known", "room", (0.2, 8), (*ROUND, 5.0), "bearing"),
     case("bearing; known", "room", (0.2, 4), (*ROUND, 5.0), "bearing", particles=3000),
     case("range, bearing; known", "grid", (0.2, 4), (*ROUND, 5.0)),
     case("range, bearing; hidden", "grid", (0.2, 3), (*ROUND, 4.0), **HIDDEN),
     case("position; known", "grid", (0.2, 4), (*ROUND, 5.0), "position"),
-    case("limits: few particles, bearing; known", "room", (0.2, 4), (*ROUND, 8.0), "bearing",
-         particles=1000),
     case("limits: precise sensor; known", "field", (0.1, 2), (*ROUND, 8.0), particles=1000),
     case("limits: new landmarks at the declared density; hidden", "grid", (0.2, 3), (*ROUND, 4.0),
          declared_density=True, proposals=("informed",), **HIDDEN),
