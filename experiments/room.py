@@ -50,9 +50,6 @@ CASES = {  # sensor, association
     HIDDEN: ("bearing", "maximum_likelihood"),
 }
 PROPOSAL = "prior"  # rooms 3 and 4: better than the informed one for positions, alike for bearings
-# A commanded step errs with its length, not with the time until the next image, so this robot is
-# not given the default's noise per second (which would be 15 mm of a step of 200).
-STEP = {"floor_tran": 0.002, "floor_rot": 0.005}
 MOTION = ("gain_tran", "gain_rot", "err_tran", "err_rot", "err_drift")
 DRAWN = 101  # seed of the room in the figures
 OFTEN = 0.1  # of the frames in which a visible edge is in view
@@ -69,7 +66,7 @@ def rendered(folder, seed, drive, preset, length=None):
 
 def extracted(place, camera, found, **settings):
     """The log of a folder of images; `found`: what is known of the robot's motion."""
-    params = default_params("position")._replace(**(STEP | found))
+    params = default_params("position")._replace(**found)
     return extract(
         place / "images", camera, place / "odometry.csv", truth=place, params=params, **settings
     )

@@ -203,12 +203,17 @@ _DEFAULTS = Params(
 # A bearing's noise is the sensor's own, so that refinement can use it as it is; the filter, which
 # can't take back a wrong depth, is cautious.
 _OF_SENSOR = {
+    "position": dict(floor_tran=0.002),  # until a log says that it is not of commands
     "bearing": dict(sigma_bearing=0.005, growth=0.03, caution=0.06, outlier=3e-3),
 }
 
 
+# A commanded step errs with its length; a speed, held from stamp to stamp, errs with time as well.
+_FLOOR_TRAN = {"command": 0.002, "velocity": 0.015}
+
+
 def default_params(sensor="range_bearing", log=None):
-    """Default `Params` of a sensor, with what the log declares: mounting, view and noise."""
+    """Default `Params` of a sensor, with what the log declares: odometry, mounting, view, noise."""
     if sensor not in SENSORS:
         raise ValueError(f"sensor: {sensor!r} is not one of {', '.join(SENSORS)}")
     params = _DEFAULTS._replace(**_OF_SENSOR.get(sensor, {}))
@@ -216,4 +221,5 @@ def default_params(sensor="range_bearing", log=None):
         return params
     names = ("mount_x", "mount_y", "mount_yaw", "view_min", "view_max", "view_range")
     params = params._replace(**dict(zip(names, (*log.mounting, *log.view), strict=True)))
+    params = params._replace(floor_tran=_FLOOR_TRAN[log.odometry_kind])
     return params._replace(**log.noise)
