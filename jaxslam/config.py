@@ -203,13 +203,13 @@ _DEFAULTS = Params(
 # A bearing's noise is the sensor's own, so that refinement can use it as it is; the filter, which
 # can't take back a wrong depth, is cautious.
 _OF_SENSOR = {
-    "position": dict(floor_tran=0.002),  # until a log says that it is not of commands
+    # Points are made with this motion, too: as tight as it was when they were tried.
+    "position": dict(err_tran=0.05, err_rot=0.05, err_drift=0.05, floor_tran=0.002),
     "bearing": dict(sigma_bearing=0.005, growth=0.03, caution=0.06, outlier=3e-3),
 }
 
 
-# A commanded step errs with its length; a speed, held from stamp to stamp, errs with time as well.
-_FLOOR_TRAN = {"command": 0.002, "velocity": 0.015}
+COMMAND_FLOOR = 0.002  # m/sqrt(s): a commanded step errs with its length, not with time
 
 
 def default_params(sensor="range_bearing", log=None):
@@ -221,5 +221,6 @@ def default_params(sensor="range_bearing", log=None):
         return params
     names = ("mount_x", "mount_y", "mount_yaw", "view_min", "view_max", "view_range")
     params = params._replace(**dict(zip(names, (*log.mounting, *log.view), strict=True)))
-    params = params._replace(floor_tran=_FLOOR_TRAN[log.odometry_kind])
+    if log.odometry_kind == "command":
+        params = params._replace(floor_tran=COMMAND_FLOOR)
     return params._replace(**log.noise)
