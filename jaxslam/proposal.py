@@ -43,8 +43,7 @@ def rows(sensor, sensor_pose, axes, mean, anchor, value):
     """
     sx, sy, heading = sensor_pose
     if sensor == "bearing":
-        dx = mean[1] * (anchor[0] - sx) + jnp.cos(mean[0])
-        dy = mean[1] * (anchor[1] - sy) + jnp.sin(mean[0])
+        (dx, dy), _, _ = sensors.ray(sensor_pose, mean, anchor)
         scale = mean[1] / (dx * dx + dy * dy)
         by_pose = [(dy * scale, -dx * scale, -1.0)]
     elif sensor == "range_bearing":

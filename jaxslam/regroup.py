@@ -133,7 +133,7 @@ def _from_bearings(given, place, groups):
         away = point[of] - sensor
         ahead, aside = np.sum(along * away, 1), np.sum(across * away, 1)
         reach = np.maximum(np.hypot(ahead, aside), 0.05)
-        variance = given.params.sigma_bearing**2 + (given.params.growth / reach) ** 2
+        variance = sensors.bearing_variance(reach, given.params)
         square = np.arctan2(aside, ahead) ** 2 / variance
         weight = given.share[used] / (reach**2 * variance * (1 + square / CAUCHY**2))
     count = np.maximum(np.bincount(of, minlength=size), 1)
