@@ -7,6 +7,7 @@
 
 import jax
 import jax.numpy as jnp
+from jax.lax import stop_gradient
 
 from jaxslam.geometry import wrap
 from jaxslam.landmarks import score
@@ -20,15 +21,16 @@ def associate(config, scorer, measurements, new, clutter, params, picks=None):
 
     `scorer`: prediction of every slot, [M, n]. `new` [K] and `clutter` []: log densities of the
     alternatives (`clutter` -inf when the configuration has none). `picks` [K, n]: uniforms behind
-    the draws of `sampled`. No gradient flows through.
+    the draws of `sampled`, and of `known` between the identity's slot and clutter (None: the one of
+    greater density). No gradient flows through.
     """
-    scorer, new, clutter, params = jax.lax.stop_gradient((scorer, new, clutter, params))
+    scorer, new, clutter, params = stop_gradient((scorer, new, clutter, params))
     new = jnp.broadcast_to(new, measurements.valid.shape)
     log_choice = jnp.zeros_like(scorer.constant[0])
     if config.association == "sampled":
         slot, log_choice = _sampled(config, scorer, measurements, new, clutter, params, picks)
     elif config.association == "known":
-        slot = _known(config, scorer, measurements, clutter, params)
+        slot, log_choice = _known(config, scorer, measurements, clutter, params, picks)
     else:
         # Padding wants no landmark, so that it takes none from a measurement.
         threshold = jnp.where(measurements.valid, jnp.maximum(new, clutter), jnp.inf)
@@ -85,16 +87,24 @@ def _sampled(config, scorer, measurements, new, clutter, params, picks):
     return slot, log_choice
 
 
-def _known(config, scorer, measurements, clutter, params):
-    """Identity i is slot i; an occupied slot that fits worse than clutter does is not taken."""
+def _known(config, scorer, measurements, clutter, params, picks=None):
+    """Identity i is slot i; an occupied slot that fits worse than clutter does is not taken, or,
+    with `picks`, taken with its share of the two. Also the log probability [n] of such draws."""
     slots, lanes = scorer.constant.shape
     slot = jnp.clip(measurements.identity, 0, slots - 1)
     rows = jax.tree.map(lambda leaf: leaf[slot], scorer)
     density = score(config.sensor, rows, *_columns(measurements), params)
     occupied = rows.constant > -jnp.inf
     slot = jnp.broadcast_to(slot[:, None], (len(slot), lanes))
-    slot = jnp.where(occupied, jnp.where(density >= clutter, slot, CLUTTER), NEW)
-    return jnp.where((measurements.identity < slots)[:, None], slot, NEW)
+    log_choice = jnp.zeros_like(rows.constant[0])
+    taken = density >= clutter
+    if picks is not None:
+        taken = picks < jax.nn.sigmoid(density - clutter)
+        chosen = jax.nn.log_sigmoid(jnp.where(taken, density - clutter, clutter - density))
+        drawn = occupied & (measurements.valid & (measurements.identity < slots))[:, None]
+        log_choice = jnp.where(drawn & (clutter > -jnp.inf), chosen, 0.0).sum(0)
+    slot = jnp.where(occupied, jnp.where(taken, slot, CLUTTER), NEW)
+    return jnp.where((measurements.identity < slots)[:, None], slot, NEW), log_choice
 
 
 def _maximum_likelihood(config, scorer, measurements, threshold, params):

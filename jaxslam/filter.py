@@ -120,9 +120,15 @@ def step(key, state, odometry, measurements, params, config):
 
 def advance(chance, state, odometry, measurements, params, config):
     """`step` with its random numbers given: `chance` is that of `draws`."""
-    pose, world, density, match, log_choice, counts = observation.observe(
+    seen = observation.observe(
         state.pose, state.landmarks, chance, odometry, measurements, params, config, state.step
     )
+    return conclude(chance, state, seen, measurements.active, config)
+
+
+def conclude(chance, state, seen, active, config):
+    """The second half of a step: weights of what was `seen` (`Observed`), estimate, resampling."""
+    pose, density, match = seen.pose, seen.density, seen.match
     # A pose that is not a number fits nothing, which would count as new landmarks: no weight.
     sound = jnp.isfinite(pose).all(0)
     density = jnp.where(sound, density, jnp.nan)
@@ -131,10 +137,10 @@ def advance(chance, state, odometry, measurements, params, config):
     estimate = _estimate(jnp.where(sound, pose, 0), weight)
     ess = 1 / jnp.sum(weight**2)
     threshold = config.resample_threshold
-    wanted = measurements.active & ((ess < threshold * config.particles) | (threshold >= 1))
-    moved = State(pose, world, log_weight, state.step + 1)
+    wanted = active & ((ess < threshold * config.particles) | (threshold >= 1))
+    moved = State(pose, seen.landmarks, log_weight, state.step + 1)
     resampled, ancestors = _resample(moved, wanted, chance.uniform, config)
-    birth = jnp.take_along_axis(world.birth, jnp.maximum(match, 0), 0)
+    birth = jnp.take_along_axis(seen.landmarks.birth, jnp.maximum(match, 0), 0)
     info = Info(
         pose=pose,
         log_weight=log_weight,
@@ -145,11 +151,11 @@ def advance(chance, state, odometry, measurements, params, config):
         ancestors=ancestors,
         match=match,
         birth=jnp.where(match >= 0, birth, match),
-        log_choice=log_choice,
+        log_choice=seen.log_choice,
         new=jnp.sum(match[:, estimate.best] == NEW),
         outliers=jnp.sum(match == CLUTTER),
-        overflow=counts[0].sum(),
-        forgotten=counts[1].sum(),
+        overflow=seen.counts[0].sum(),
+        forgotten=seen.counts[1].sum(),
         nonfinite=flags[0],
         degenerate=flags[1],
     )

@@ -25,7 +25,8 @@ class Chance(NamedTuple):
 class Observed(NamedTuple):
     """Particles after a frame: `pose` [3, N] and map; `density` [N], log of motion x measurements
     over what pose and associations were drawn from; `match` [K, N]; `log_choice` [N], log
-    probability of its draw; `counts` [2, N]: landmarks lost for want of a slot, and forgotten."""
+    probability of its draw; `counts` [2, N]: landmarks lost for want of a slot, and forgotten;
+    `u` [3, N]: the normals that `motion.sample` made the poses of."""
 
     pose: jax.Array
     landmarks: Landmarks
@@ -33,10 +34,16 @@ class Observed(NamedTuple):
     match: jax.Array
     log_choice: jax.Array
     counts: jax.Array
+    u: jax.Array
 
 
-def observe(pose, world, chance, odometry, measurements, params, config, number):
-    """`Observed` of N particles; `pose` [3, N] is from before the motion, `number` the step's."""
+def observe(pose, world, chance, odometry, measurements, params, config, number, frozen=False):
+    """`Observed` of N particles; `pose` [3, N] is from before the motion, `number` the step's.
+
+    `frozen`: for derivatives by `params` poses are what was drawn, whatever drew them, and the
+    density's derivative is that of the measurements alone (see `likelihood`).
+    """
+    hold = jax.lax.stop_gradient if frozen else lambda value: value
     n, size = config.particles, block_size(config)
     measurements = sensors.rescaled(measurements, params)
     params = params._replace(sigma_bearing=geometry.norm(params.sigma_bearing, params.caution))
@@ -44,7 +51,7 @@ def observe(pose, world, chance, odometry, measurements, params, config, number)
         params = params._replace(outlier=jnp.zeros(()))
     # Outside the loop: XLA would work out cosine and sine again for every landmark.
     u = jnp.zeros_like(pose) if config.proposal == "informed" else chance.normals
-    predicted = jnp.stack(motion.sample(pose, odometry, params, u))
+    predicted = hold(jnp.stack(motion.sample(pose, odometry, params, u)))
     sensor_pose = jnp.stack(sensors.pose_of(tuple(predicted), params))
     particles = pose, predicted, sensor_pose, chance.normals, chance.picks
     frame = odometry, measurements, params, number
@@ -58,8 +65,8 @@ def observe(pose, world, chance, odometry, measurements, params, config, number)
         # reading and writing of the large arrays stops its vectorisation: ten times slower.
         done = jax.lax.cond(
             measurements.active,
-            lambda mine: _look(*mine, *frame, config),
-            lambda mine: _nothing(*mine, *frame, config),
+            lambda mine: _look(*mine, *frame, config, hold),
+            lambda mine: _nothing(*mine, *frame, config, hold),
             mine,
         )
         return jax.tree.map(
@@ -70,7 +77,8 @@ def observe(pose, world, chance, odometry, measurements, params, config, number)
 
     match = jnp.full((config.measurements, n), association.PADDING, jnp.int32)
     zero = jnp.zeros(n, pose.dtype)
-    start = Observed(predicted, world, zero, match, zero, jnp.zeros((2, n), jnp.int32))
+    counts = jnp.zeros((2, n), jnp.int32)
+    start = Observed(predicted, world, zero, match, zero, counts, chance.normals)
     return jax.lax.fori_loop(0, n // size, block, start)
 
 
@@ -80,18 +88,19 @@ def block_size(config):
     return next(size for size in range(min(config.block, n), 0, -1) if n % size == 0)
 
 
-def _nothing(particles, world, odometry, measurements, params, number, config):
+def _nothing(particles, world, odometry, measurements, params, number, config, hold):
     """`Observed` of a block in a frame without a look: it moves."""
     pose, predicted, _, normals, _ = particles
     if config.proposal == "informed":
-        predicted = jnp.stack(motion.sample(pose, odometry, params, normals))
+        predicted = hold(jnp.stack(motion.sample(pose, odometry, params, normals)))
     size = pose.shape[1]
     match = jnp.full((config.measurements, size), association.PADDING, jnp.int32)
     zero = jnp.zeros(size, pose.dtype)
-    return Observed(predicted, world, zero, match, zero, jnp.zeros((2, size), jnp.int32))
+    counts = jnp.zeros((2, size), jnp.int32)
+    return Observed(predicted, world, zero, match, zero, counts, normals)
 
 
-def _look(particles, before, odometry, measurements, params, number, config):
+def _look(particles, before, odometry, measurements, params, number, config, hold):
     """`Observed` of a block: associate, move (when informed), weigh and update, create, forget."""
     pose, predicted, sensor_pose, normals, picks = particles
     sensor, informed = config.sensor, config.proposal == "informed"
@@ -108,11 +117,11 @@ def _look(particles, before, odometry, measurements, params, number, config):
     match, log_choice = association.associate(
         config, scorer, measurements, new, clutter, params, picks
     )
-    log_ratio = 0.0
+    log_ratio, u = 0.0, normals
     if informed:
         whitened = proposal.inform(sensor, sensor_pose, axes, before, match, measurements, noise)
-        u, log_ratio = proposal.draw(whitened, normals)
-        predicted = jnp.stack(motion.sample(pose, odometry, params, u))
+        u, log_ratio = hold(proposal.draw(whitened, normals))
+        predicted = hold(jnp.stack(motion.sample(pose, odometry, params, u)))
         sensor_pose = jnp.stack(sensors.pose_of(tuple(predicted), params))
     world, density = landmarks.update_matched(
         sensor, tuple(sensor_pose), before, match, measurements, noise
@@ -128,4 +137,5 @@ def _look(particles, before, odometry, measurements, params, number, config):
         world, forgotten = landmarks.existence(world, seen, params)
     counts = jnp.stack([overflow, forgotten]).astype(jnp.int32)
     density = density + log_ratio - log_choice
-    return Observed(predicted, landmarks.settle(world), density, match, log_choice, counts)
+    world = landmarks.settle(world)
+    return Observed(predicted, world, density, match, log_choice, counts, u)
