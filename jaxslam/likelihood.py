@@ -42,12 +42,14 @@ OF_SENSOR = {
 
 
 class Data(NamedTuple):
-    """What the likelihood is of: `start_pose` [3], `start_cov` [3, 3], and T frames' arrays."""
+    """What the likelihood is of: `start_pose` [3], `start_cov` [3, 3], T frames' arrays, and a map
+    to start with (None: empty), as `filter.init` takes it."""
 
     start_pose: jax.Array
     start_cov: jax.Array
     odometry: Odometry
     measurements: Measurements
+    landmarks_given: tuple | None = None
 
 
 class Score(NamedTuple):
@@ -160,14 +162,19 @@ _differentiable.defjvp(_derivative, symbolic_zeros=True)
 def value(params, data, key, config):
     """The estimate of the log likelihood alone."""
     start, key = jax.random.split(key)
-    state = fastslam.init(config, start, data.start_pose, data.start_cov)
+    state = _begin(data, start, config)
 
     def step(state, frame):
         chance = draws(key, state.step, config)
         state, info = fastslam.advance(chance, state, *frame, params, config)
         return state, info.log_evidence + frame_terms(frame[1], params)
 
-    return jax.lax.scan(step, state, data[2:])[1].sum()
+    return jax.lax.scan(step, state, (data.odometry, data.measurements))[1].sum()
+
+
+def _begin(data, key, config):
+    """`filter.State` before the first frame."""
+    return fastslam.init(config, key, data.start_pose, data.start_cov, data.landmarks_given)
 
 
 def draws(key, step, config):
@@ -211,7 +218,7 @@ def scored(params, data, key, config, names, estimator="fisher", discount=DISCOU
     """`score` of `Data`, unchecked, for use inside other compiled programs."""
     frozen = estimator == "fisher"
     start, key = jax.random.split(key)
-    state = fastslam.init(config, start, data.start_pose, data.start_cov)
+    state = _begin(data, start, config)
     through = _through(names, config, data.measurements, frozen)
     zero = jnp.zeros((len(through), *state.pose.shape), state.pose.dtype)
     carry = _Carry(
@@ -226,7 +233,9 @@ def scored(params, data, key, config, names, estimator="fisher", discount=DISCOU
     def step(carry, frame):
         return _step(carry, frame, params, key, config, names, through, estimator, discount)
 
-    last, (steps, log_evidence, ess, extra) = jax.lax.scan(step, carry, data[2:])
+    last, (steps, log_evidence, ess, extra) = jax.lax.scan(
+        step, carry, (data.odometry, data.measurements)
+    )
     weight = jnp.exp(last.state.log_weight)
     at_end = last.inherited @ weight + extra.sum(0)
     whole = discount == 1 if frozen else estimator == "pathwise"
