@@ -13,6 +13,7 @@ what it adds to the step at hand is mostly noise (Poyiadjis, Doucet and Singh 20
 that of MOP, Tan, Hooker and Ionides 2024). docs/gradients.md says when to distrust which.
 """
 
+import warnings
 from functools import partial
 from typing import NamedTuple
 
@@ -30,6 +31,10 @@ from jaxslam.sensors import Measurements
 
 ESTIMATORS = ("fisher", "pathwise", "plain")
 DISCOUNT = 0.97
+BIASED = (
+    "association 'maximum_likelihood' biases the score: noise comes out too small where landmarks "
+    "are close; learn with 'sampled'"
+)
 OF_MOTION = ("err_tran", "err_rot", "err_drift", "floor_tran", "floor_rot")
 OF_MOTION += ("gain_tran", "gain_rot", "bias_drift")
 OF_ALTERNATIVES = ("outlier", "density_new")
@@ -103,7 +108,7 @@ def log_likelihood(params, log, key, config, estimator="fisher", discount=DISCOU
     are zero. The value includes, besides the filter's evidence, the probability of as few new
     landmarks as there were (`frame_terms`). Raises `ValueError` for an estimator that is not there.
     """
-    _check(config, estimator)
+    check(config, estimator)
     data = log if isinstance(log, Data) else data_of(log, config)
     numbers = Params(*(jnp.asarray(value, data.start_pose.dtype) for value in params))
     discount = jnp.asarray(discount, data.start_pose.dtype)
@@ -119,13 +124,14 @@ def score(params, log, key, config, names, estimator="fisher", discount=DISCOUNT
     differentiation of the filter gives, biased; for comparison. `discount` is `fisher`'s alone.
     Raises `ValueError` for names that have no derivative.
     """
-    _check(config, estimator, names)
+    check(config, estimator, names)
     data = log if isinstance(log, Data) else data_of(log, config)
     numbers = Params(*(jnp.asarray(value, data.start_pose.dtype) for value in params))
     return scored(numbers, data, key, config, tuple(names), estimator, discount)
 
 
-def _check(config, estimator, names=()):
+def check(config, estimator="fisher", names=()):
+    """Raise `ValueError` for what is not there; warn of an association that biases the score."""
     if estimator not in ESTIMATORS:
         raise ValueError(f"estimator: {estimator!r} is not one of {', '.join(ESTIMATORS)}")
     allowed = learnable(config)
@@ -135,6 +141,8 @@ def _check(config, estimator, names=()):
                 f"{name!r} can't be learnt with sensor {config.sensor}; these can: "
                 f"{', '.join(allowed)}"
             )
+    if config.association == "maximum_likelihood":
+        warnings.warn(BIASED, stacklevel=3)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
