@@ -1,13 +1,21 @@
 """Parameter files: TOML, one line per parameter with its unit and meaning.
 
 `name = value  # unit, meaning`, and standard errors, where known, in a table `[standard_error]`. A
-file may hold only some of the names.
+file may hold only some of the names. What is to be learnt, and how, may be told in three tables:
+
+    [learn]
+    parameters = ["err_rot", "sigma_bearing"]
+    [bounds]  # lowest and highest, in the parameter's unit
+    err_rot = [0.01, 1.0]
+    [prior]  # value in its unit; standard deviation of its logarithm (outlier: of its log-odds;
+    err_rot = [0.1, 0.5]  # mount_x, mount_y, mount_yaw, bias_drift: in `learn.SCALE`)
 """
 
 import math
 import tomllib
 from difflib import get_close_matches
 from pathlib import Path
+from typing import NamedTuple
 
 from jaxslam.atomic import replacing
 from jaxslam.config import UNITS, Params
@@ -49,7 +57,19 @@ ABOVE_ZERO += ("density_new", "view_range", "inv_depth_mean", "inv_depth_sd", "e
 AT_LEAST_ZERO = ("err_tran", "err_rot", "err_drift", "floor_tran", "floor_rot", "growth")
 AT_LEAST_ZERO += ("correlation", "caution", "existence_seen", "existence_miss")
 ERRORS = "standard_error"
+LEARN, BOUNDS, PRIOR = "learn", "bounds", "prior"
+PAIRS = {BOUNDS: "[lowest, highest]", PRIOR: "[value, standard deviation]"}
 MAX_BYTES = 1 << 20
+
+
+class Learning(NamedTuple):
+    """What a file says of learning: where to start, which `names` (None: not said), `bounds` and
+    `priors` as pairs by name."""
+
+    params: Params
+    names: tuple | None = None
+    bounds: dict | None = None
+    priors: dict | None = None
 
 
 def validate(params, where):
@@ -86,20 +106,91 @@ def load_params(path, base):
 
     Raises `ValueError` naming file, name, what was found and what is allowed.
     """
+    return _load(path, base).params
+
+
+def load_learning(path, base):
+    """`Learning` of a file: as `load_params`, with the tables that a run is not concerned with.
+
+    Raises `ValueError` as that does, and for a start outside its bounds.
+    """
+    found = _load(path, base)
+    for name, (low, high) in found.bounds.items():
+        start = getattr(found.params, name)
+        if not low <= start <= high:
+            told = f"{name} starts at {start:g}, outside its bounds {low:g} to {high:g}"
+            raise ValueError(f"{path}: {told}")
+    return found
+
+
+def _load(path, base):
     table = _read(Path(path))
-    errors = table.pop(ERRORS, {})
-    if not isinstance(errors, dict):
-        raise ValueError(f"{path}: {ERRORS} is {errors!r}; must be a table, [{ERRORS}]")
+    errors, learn = (_table(path, table, part) for part in (ERRORS, LEARN))
+    pairs = {part: _table(path, table, part) for part in PAIRS}
     for place, names in (("", table), (f"{ERRORS}.", errors)):
         for name, value in names.items():
             _check_name(path, place, name)
             if _number(path, place + name, value) < 0 and place:
                 raise ValueError(f"{path}: {place}{name} is {value!r}; must be 0 or more")
-    return validate(base._replace(**table), path)
+    params = validate(base._replace(**table), path)
+    for part, names in pairs.items():
+        for name, value in names.items():
+            _check_name(path, f"{part}.", name)
+            pairs[part] = pairs[part] | {name: _pair(path, part, name, value, params)}
+    return Learning(params, _names(path, learn), pairs[BOUNDS], pairs[PRIOR])
 
 
-def save_params(path, params, standard_errors=None):
+def _table(path, table, part):
+    """The table of that name, taken out; empty where there is none."""
+    found = table.pop(part, {})
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: {part} is {found!r}; must be a table, [{part}]")
+    return found
+
+
+def _names(path, learn):
+    """What `[learn]` names, or None."""
+    for key in learn:
+        if key != "parameters":
+            raise ValueError(f"{path}: {LEARN}.{key} is not known; there is: parameters")
+    names = learn.get("parameters")
+    if names is None:
+        return None
+    if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
+        wanted = '["err_rot", "err_drift"]'
+        raise ValueError(f"{path}: {LEARN}.parameters is {names!r}; must be names, like {wanted}")
+    for name in names:
+        _check_name(path, f"{LEARN}.parameters: ", name)
+    if len(set(names)) < len(names):
+        raise ValueError(f"{path}: {LEARN}.parameters names one of {', '.join(names)} twice")
+    return tuple(names)
+
+
+def _pair(path, part, name, value, params):
+    """Two numbers of `[bounds]` or `[prior]`."""
+    where = f"{part}.{name}"
+    if not isinstance(value, list) or len(value) != 2:
+        raise ValueError(f"{path}: {where} is {value!r}; must be {PAIRS[part]}")
+    first, second = (_number(path, where, number) for number in value)
+    in_range = (first, second) if part == BOUNDS else (first,)
+    for number in in_range:
+        good, allowed = _ranges(params._replace(**{name: number})._asdict()).get(name, (True, ""))
+        if not good:
+            raise ValueError(f"{path}: {where} holds {number:g}; must be {allowed}")
+    if part == BOUNDS and not first < second:
+        raise ValueError(f"{path}: {where} is {value}; must be {PAIRS[part]}")
+    if part == PRIOR and second <= 0:
+        raise ValueError(f"{path}: {where}: standard deviation {second:g}; must be above 0")
+    if part == PRIOR and first <= 0 and name in _ranges(params._asdict()):
+        raise ValueError(f"{path}: {where} is about {first:g}, which has no logarithm; above 0")
+    return first, second
+
+
+def save_params(path, params, standard_errors=None, learning=None):
     """Write `params` to a file, all or nothing; `standard_errors`: a dict by name, or None.
+
+    `learning`: a `Learning` whose names, bounds and priors are written too, so that the file can
+    start another fit.
 
     Raises `ValueError` when a value is out of range or the place can't be written.
     """
@@ -112,8 +203,23 @@ def save_params(path, params, standard_errors=None):
         for name, value in standard_errors.items():
             _check_name(path, f"{ERRORS}.", name)
             lines.append(f"{name} = {_number(path, f'{ERRORS}.{name}', value)!r}\n")
+    if learning is not None:
+        lines += _learning_lines(path, learning)
     with replacing(path) as file:
         file.write("".join(lines).encode())
+
+
+def _learning_lines(path, learning):
+    """The tables of a `Learning`."""
+    if learning.names is not None:
+        names = ", ".join(f'"{name}"' for name in _names(path, {"parameters": [*learning.names]}))
+        yield f"\n[{LEARN}]\nparameters = [{names}]\n"
+    for part, pairs in ((BOUNDS, learning.bounds or {}), (PRIOR, learning.priors or {})):
+        if pairs:
+            yield f"\n[{part}]  # {PAIRS[part]}\n"
+        for name, pair in pairs.items():
+            _check_name(path, f"{part}.", name)
+            yield f"{name} = {list(_pair(path, part, name, [*pair], learning.params))}\n"
 
 
 def _read(path):

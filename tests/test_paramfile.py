@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from jaxslam.config import UNITS, Params, default_params
-from jaxslam.paramfile import MEANING, load_params, save_params, validate
+from jaxslam.paramfile import (
+    MEANING,
+    Learning,
+    load_learning,
+    load_params,
+    save_params,
+    validate,
+)
 
 BASE = default_params()
 
@@ -18,10 +25,10 @@ def write(tmp_path, text):
     return path
 
 
-def refused(path, base=BASE):
+def refused(path, base=BASE, load=load_params):
     """The one line of the refusal, which begins with the file."""
     with pytest.raises(ValueError, match=re.escape(str(path))) as caught:
-        load_params(path, base)
+        load(path, base)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -140,3 +147,89 @@ def test_nothing_is_written_in_vain(tmp_path):
     with pytest.raises(ValueError, match="cannot write"):
         save_params(folder, BASE)
     assert list(tmp_path.iterdir()) == [folder]
+
+
+LEARNING = """err_rot = 0.2
+[standard_error]
+err_rot = 0.03
+[learn]
+parameters = ["err_rot", "mount_yaw"]
+[bounds]
+err_rot = [0, 1]
+mount_yaw = [-0.2, 0.2]
+[prior]
+err_rot = [0.1, 0.5]
+mount_yaw = [0, 1]
+outlier = [0.01, 2]
+"""
+
+
+def test_what_is_to_be_learnt_is_read_and_a_run_does_without(tmp_path):
+    path = write(tmp_path, LEARNING)
+    found = load_learning(path, BASE)
+    assert found == Learning(
+        BASE._replace(err_rot=0.2),
+        ("err_rot", "mount_yaw"),
+        {"err_rot": (0.0, 1.0), "mount_yaw": (-0.2, 0.2)},
+        {"err_rot": (0.1, 0.5), "mount_yaw": (0.0, 1.0), "outlier": (0.01, 2.0)},
+    )
+    assert load_params(path, BASE) == BASE._replace(err_rot=0.2)
+    again = tmp_path / "again.toml"
+    save_params(again, found.params, {"err_rot": 0.03}, found)
+    assert load_learning(again, BASE._replace(err_rot=0.9)) == found
+    assert "[standard_error]\nerr_rot = 0.03\n" in again.read_text()
+
+
+def test_without_tables_nothing_is_said_of_learning(tmp_path):
+    assert load_learning(write(tmp_path, "err_rot = 1"), BASE) == Learning(
+        BASE._replace(err_rot=1.0), None, {}, {}
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("learn = 3", "learn is 3; must be a table, [learn]"),
+        ("[learn]\nparameter = ['err_rot']", "learn.parameter is not known; there is: parameters"),
+        ("[learn]\nparameters = 'err_rot'", "learn.parameters is 'err_rot'; must be names"),
+        ("[learn]\nparameters = []", "learn.parameters is []; must be names"),
+        ("[learn]\nparameters = [1]", "learn.parameters is [1]; must be names"),
+        ("[learn]\nparameters = ['err_rt']", "learn.parameters: err_rt is no parameter; did you"),
+        ("[learn]\nparameters = ['err_rot', 'err_rot']", "names one of err_rot, err_rot twice"),
+        ("bounds = [1, 2]", "bounds is [1, 2]; must be a table"),
+        ("[bounds]\nerr_rt = [1, 2]", "bounds.err_rt is no parameter; did you mean err_rot?"),
+        ("[bounds]\nerr_rot = 1", "bounds.err_rot is 1; must be [lowest, highest]"),
+        ("[bounds]\nerr_rot = [1, 2, 3]", "must be [lowest, highest]"),
+        ("[bounds]\nerr_rot = [2, 1]", "bounds.err_rot is [2, 1]; must be [lowest, highest]"),
+        ("[bounds]\nerr_rot = [1, 1]", "must be [lowest, highest]"),
+        ("[bounds]\nerr_rot = [-1, 1]", "bounds.err_rot holds -1; must be 0 rad/sqrt(rad) or more"),
+        ("[bounds]\nerr_rot = [0, '1']", "bounds.err_rot is '1'; must be a finite number"),
+        ("[bounds]\noutlier = [0.1, 1]", "bounds.outlier holds 1; must be a probability"),
+        ("[prior]\nerr_rot = [0.1]", "prior.err_rot is [0.1]; must be [value, standard deviation]"),
+        ("[prior]\nerr_rot = [0.1, 0]", "prior.err_rot: standard deviation 0; must be above 0"),
+        ("[prior]\nerr_rot = [-0.1, 1]", "prior.err_rot holds -0.1; must be 0 rad/sqrt(rad) or"),
+        ("[prior]\nerr_rot = [0, 1]", "prior.err_rot is about 0, which has no logarithm"),
+    ],
+)
+def test_bad_tables_are_refused_by_a_run_as_well(tmp_path, text, found):
+    assert found in refused(write(tmp_path, text))
+    assert found in refused(write(tmp_path, text), load=load_learning)
+
+
+def test_a_start_outside_its_bounds_concerns_learning_only(tmp_path):
+    path = write(tmp_path, "err_rot = 0.5\n[bounds]\nerr_rot = [0.1, 0.4]")
+    assert load_params(path, BASE).err_rot == 0.5
+    message = refused(path, load=load_learning)
+    assert "err_rot starts at 0.5, outside its bounds 0.1 to 0.4" in message
+
+
+def test_tables_that_are_wrong_are_not_written(tmp_path):
+    path = tmp_path / "params.toml"
+    for learning in (
+        Learning(BASE, ("err_rt",)),
+        Learning(BASE, bounds={"err_rot": (2, 1)}),
+        Learning(BASE, priors={"err_rot": (0.1, -1)}),
+    ):
+        with pytest.raises(ValueError, match=r"params\.toml: "):
+            save_params(path, BASE, None, learning)
+    assert not path.exists()
