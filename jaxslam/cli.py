@@ -16,9 +16,11 @@ from jaxslam import cli_images
 from jaxslam.config import ASSOCIATIONS, PROPOSALS
 from jaxslam.console import (
     DEMO,
+    End,
     LogName,
     Overwrite,
     Seed,
+    Start,
     bar,
     check_new,
     note,
@@ -87,6 +89,8 @@ def run(
     landmarks: whole("slots of the map (64; known: one each)") | None = None,
     params: ParamFile = None,
     paper: Paper = False,
+    start: Start = 0.0,
+    end: End = None,
     no_refine: option(bool, "only filter: path and map are not refined afterwards") = False,
     seed: Seed = 0,
     out: option(Path, "folder to write (runs/LOG-SENSOR-SEED)") | None = None,
@@ -103,9 +107,11 @@ def run(
     """
     with bar("reading"):
         from jaxslam import report, runner
+        from jaxslam.cut import cut
         from jaxslam.log import load_log
 
-        loaded = load_log(log)
+        loaded, part = load_log(log), bool(start) or end is not None
+        loaded = cut(loaded, start, end) if part else loaded
     model = _model(loaded, sensor, association, particles, landmarks, params, paper, proposal)
     out = out or Path("runs") / f"{Path(log).stem}-{model[0].sensor}-{seed}"
     report.check_target(out, overwrite)
@@ -115,7 +121,7 @@ def run(
         with bar("refining") as progress:
             result = runner.refined(result, progress)
     with bar("writing"):
-        report.save(result, out, overwrite, log_source=log)
+        report.save(result, out, overwrite, log_source=None if part else log)
     _told(result, out)
     return int(bool(result.flags))
 

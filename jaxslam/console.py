@@ -23,6 +23,8 @@ def whole(text, least=1, most=10**9):
 Seed = whole("of the random draws: the same seed, the same run", 0, 2**32 - 1)
 LogName = option(str, f"a .npz file, or {DEMO}")
 Overwrite = option(bool, "replace what is there")
+Start = option(float, "use the log from here on [s after its start]")
+End = option(float, "use the log up to here [s after its start] (all)") | None
 OutLog = option(Path, "the log to write, a .npz file")
 
 

@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 
 from jaxslam.evaluate import truth_at
-from jaxslam.log import Truth
 
 PER_ROW = ("bearing", "bearing_sigma", "range", "point", "point_cov", "point_baseline")
 PER_ROW += ("identity", "descriptor")

@@ -114,6 +114,18 @@ def test_informed_and_drawn(log, call):
     assert (config.association, config.proposal) == ("sampled", "informed")
 
 
+def test_a_part_of_a_log_is_kept_beside_its_results(log, call, refuse):
+    part = "run", log, *MANY, "--out", "part", "--start", "2", "--end", "4"
+    assert call(*part)[0] == 0
+    whole, used = load_log(log), load_log("part/log.npz")
+    assert used.start == whole.start + 2 * 10**9
+    assert len(used.frame_time) == 10  # 5 per second
+    errors = json.loads(call("evaluate", "part", "--json")[1])
+    assert errors["truth_frames"] == 10
+    assert errors["ate_filtered_unaligned_rmse_m"] < 0.2
+    assert "no frame between 90 and 99 s" in refuse("run", log, "--start", "90", "--end", "99")
+
+
 def test_overwriting_keeps_the_old_folder_until_the_new_one_is_there(log, call):
     run = "run", log, *MANY, "--out", "result"
     assert call(*run)[0] == 0

@@ -1,6 +1,7 @@
 """Parts of a log: nothing lost, nothing twice, and each a log of its own."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -75,7 +76,7 @@ def test_windows_part_a_log(log):
         np.testing.assert_array_equal(truth_at(piece.truth, piece.frame_time), true)
         assert len(piece.truth.time) < len(log.truth.time) / 2
     np.testing.assert_array_equal(pieces[0].start_pose, log.start_pose)
-    for before, after in zip(pieces, pieces[1:], strict=False):
+    for before, after in itertools.pairwise(pieces):
         end = truth_at(log.truth, before.frame_time[-1:])[0]
         np.testing.assert_allclose(after.start_pose, end, atol=1e-12)
 
