@@ -65,16 +65,19 @@ def test_the_normal_after_updates_is_bayes_rule(x64):
         assert whitened.log_det[i] == pytest.approx(0.5 * np.log(np.linalg.det(cov)), abs=1e-12)
 
 
-def enumerated(odometry, measurements, params, steps):
-    """log Z with hidden associations: the sum over all of them, each by a joint Kalman filter.
+def enumerated(
+    odometry, measurements, params, steps, begin=(START[:2], START_COV[:2, :2]), identified=False
+):
+    """log Z of every association there can be [B], each by a joint Kalman filter.
 
     A measurement is of any landmark begun so far that no other of its frame is of, or begins one,
-    or is clutter.
+    or is clutter. `begin`: mean and covariance of the start's position and of a given map.
+    `identified`: of the landmark of its identity or clutter, or new if there is none yet.
     """
     new = np.log1p(-params.outlier) + np.log(params.density_new)
     clutter = float(sensors.log_clutter_density("position", params))
     heading = START[2] + np.concatenate([[0.0], np.cumsum(odometry.dtheta)])
-    branches = [(0.0, START[:2], START_COV[:2, :2])]
+    branches = [(0.0, *begin)]
     for t in range(steps):
         o = Odometry(*(float(part[t]) for part in odometry))
         angle = heading[t] + np.arctan2(o.dy, o.dx)
@@ -86,22 +89,26 @@ def enumerated(odometry, measurements, params, steps):
         ks, grown = np.flatnonzero(measurements.valid[t]), []
         for log_z, mean, cov in branches:
             mean, cov = mean.copy(), cov.copy()
-            mean[:2] += turn @ [np.hypot(o.dx, o.dy), 0]
+            mean[:2] += turn @ [params.gain_tran * np.hypot(o.dx, o.dy), 0]
             cov[:2, :2] += noise
             known = len(mean) // 2 - 1
-            for choice in product([*range(known), NEW, CLUTTER], repeat=len(ks)):
+            options = [[*range(known), NEW, CLUTTER]] * len(ks)
+            if identified:
+                own = measurements.identity[t, ks]
+                options = [[i, CLUTTER] if i < known else [NEW] for i in own]
+            for choice in product(*options):
                 taken = [c for c in choice if c >= 0]
                 if len(set(taken)) == len(taken):
                     grown.append(branch(log_z, mean, cov, choice, ks, t, rotation, measurements,
                                         params, new, clutter))  # fmt: skip
         branches = grown
-    return np.logaddexp.reduce([log_z for log_z, *_ in branches])
+    return np.array([log_z for log_z, *_ in branches])
 
 
 def branch(log_z, mean, cov, choice, ks, t, rotation, measurements, params, new, clutter):
     for k, slot in zip(ks, choice, strict=True):
         z = measurements.value[t, k]
-        xx, xy, yy = measurements.cov[t, k]
+        xx, xy, yy = measurements.cov[t, k] * params.position_scale**2
         noise = np.array([[xx, xy], [xy, yy]])
         if slot == CLUTTER:
             log_z += clutter
@@ -134,7 +141,7 @@ def test_drawn_associations_give_the_evidence_of_all(x64, kind):
         sensor="position", association="sampled", proposal=kind, particles=6, landmarks=6,
         measurements=2, resample_threshold=0.7, forgetting=False,
     )  # fmt: skip
-    log_z = enumerated(odometry, measurements, params, steps)
+    log_z = np.logaddexp.reduce(enumerated(odometry, measurements, params, steps))
     data = jax.tree.map(jnp.asarray, (odometry, measurements, params))
 
     @jax.jit
