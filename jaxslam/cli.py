@@ -12,7 +12,7 @@ from typing import Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
-from jaxslam import cli_images
+from jaxslam import cli_images, cli_learn
 from jaxslam.config import ASSOCIATIONS, PROPOSALS
 from jaxslam.console import (
     DEMO,
@@ -49,6 +49,7 @@ app.command(simulate)
 app.command(cli_images.calibrate)
 app.command(cli_images.extract)
 app.command(cli_images.triangulate)
+app.command(cli_learn.learn, usage="Usage: jaxslam learn [OPTIONS] LOG...")
 simulate.command(cli_images.room)
 
 

@@ -30,7 +30,8 @@ OutLog = option(Path, "the log to write, a .npz file")
 
 @contextmanager
 def bar(what, compiles=False):
-    """A progress bar on stderr; gives a function of (done, total), or None without a terminal.
+    """A progress bar on stderr; gives a function of (done, total, text to show), or None without a
+    terminal.
 
     `total` is None where no one knows. `compiles`: until the first is done, JAX compiles.
     """
@@ -42,8 +43,9 @@ def bar(what, compiles=False):
     with progress.Progress(console=console.Console(stderr=True), transient=True) as shown:
         task = shown.add_task(what, total=None)
 
-        def show(done, total):
-            text = f"{what}: compiling… (once)" if compiles and not done else what
+        def show(done, total, more=""):
+            more = "compiling… (once)" if compiles and not done else more
+            text = f"{what}: {more}" if more else what
             length = total if done else None  # None: it swings to and fro
             shown.update(task, description=text, completed=done, total=length, refresh=True)
 
