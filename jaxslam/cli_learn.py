@@ -224,11 +224,9 @@ def _pair(text, names):
 def _fitted(train, judges, config, task, seeds, steps, seed, files, resume):
     """The fit; a stopped one says how to go on."""
     from jaxslam.learn import fit
-    from jaxslam.likelihood import BIASED
 
     try:
-        with _telling("learning") as progress, warnings.catch_warnings():
-            warnings.filterwarnings("ignore", re.escape(BIASED))  # told in the end, in a line
+        with _telling("learning") as progress, _bias_told_later():
             return fit(
                 train, config, task.params, task.names, judges, task.bounds, task.priors,
                 seeds=seeds, steps=steps, seed=seed, checkpoint=files["checkpoint"],
@@ -238,6 +236,16 @@ def _fitted(train, judges, config, task, seeds, steps, seed, files, resume):
         if files["checkpoint"].exists():
             warn("stopped; the same command with --resume goes on from here")
         raise
+
+
+@contextmanager
+def _bias_told_later():
+    """No warning of Python's about an association that biases: a line says so in the end."""
+    from jaxslam.likelihood import BIASED
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", re.escape(BIASED))
+        yield
 
 
 @contextmanager
@@ -324,7 +332,7 @@ def _models(train, judges, fit, seeds, steps, seed):
     """Print which sensor error model the held-out logs prefer; whether something went wrong."""
     from jaxslam import error_models
 
-    with bar("error models", compiles=True) as progress:
+    with bar("error models", compiles=True) as progress, _bias_told_later():
         rows = error_models.compare(
             train, judges, fit.config, fit.params, fit.names, seeds, steps, seed, progress
         )

@@ -23,14 +23,14 @@ LEVELS = (-1000, -300, -100, -30, -10, -4.5, -2, -0.5, 0)  # nats below the top
 
 class Surface(NamedTuple):
     """Log likelihood [A, B], mean over seeds, at free values `first` [A] and `second` [B] of the
-    two parameters `names`, all others as estimated. `seeds_differ`: standard deviation of one
-    seed's differences to the mean from cell to cell, which can't be told from a slope."""
+    two parameters `names`, all others as estimated. `noise`: standard deviation of that mean from
+    cell to cell, by how the seeds differ; what differs by less is no slope."""
 
     names: tuple
     first: np.ndarray
     second: np.ndarray
     log_likelihood: np.ndarray
-    seeds_differ: float
+    noise: float
 
 
 def surface(logs, fit, errors, pair, seeds=2, seed=0, progress=None):
@@ -59,7 +59,7 @@ def surface(logs, fit, errors, pair, seeds=2, seed=0, progress=None):
     by_seed = np.array(columns)
     mean = by_seed.mean(2)
     rest = by_seed - mean[..., None]
-    noise = float((rest - rest.mean((0, 1))).std() * np.sqrt(seeds / (seeds - 1)))
+    noise = float((rest - rest.mean((0, 1))).std() / np.sqrt(seeds - 1))
     return Surface(tuple(pair), first, second, mean, noise)
 
 
@@ -97,7 +97,7 @@ def draw_surface(found, fit, errors):
         axes.contour(x, y, shown, LEVELS, colors="white", linewidths=0.5)
         told = figure.colorbar(filled, label="log likelihood below its top [nats]", ticks=LEVELS)
         told.ax.set_yticklabels([f"{level:g}" for level in LEVELS])
-        axes.set_title(f"one seed differs by {found.seeds_differ:.1f} nats from cell to cell")
+        axes.set_title(f"noise from cell to cell: ± {found.noise:.2g} nats")
         _draw_path(axes, found, fit, errors, where)
         for side, name, values in (("x", found.names[0], x), ("y", found.names[1], y)):
             fit_axis(axes, side, name, values.min(), values.max())
@@ -117,7 +117,8 @@ def _draw_path(axes, found, fit, errors, where):
     lined = [withStroke(linewidth=2.6, foreground="white")]
     path, at = fit.history.free[:, where], fit.free[where]
     axes.plot(*own(path), color="#222222", lw=1.2, label="path of the fit", path_effects=lined)
-    axes.plot(*own(path[:1]), "o", color=RECKONING, mec="white", ms=8, label="start", zorder=5)
+    axes.plot(*own(path[:1]), "o", color=RECKONING, mec="white", ms=8, label="start", zorder=5,
+              clip_on=False)  # fmt: skip
     axes.plot(*own(at[None]), "P", color=LANDMARK, mec="white", ms=9, label="estimate", zorder=5)
     cov = errors.covariance[np.ix_(where, where)]
     if not np.diag(cov).max() < KNOWN**2:
