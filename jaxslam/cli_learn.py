@@ -118,6 +118,8 @@ def _files(out, surface, overwrite, resume):
             f"{files['checkpoint']}: a fit was stopped here; --resume goes on, "
             "--overwrite begins anew"
         )
+    if resume and not files["checkpoint"].exists():
+        raise ValueError(f"{files['checkpoint']}: is not there; begin without --resume")
     return files
 
 
@@ -182,8 +184,8 @@ def _config(parts, sensor, association, particles, landmarks):
 
 def _task(train, config, path, parameters):
     """`paramfile.Learning`: where to start, what to learn, in which bounds, with which priors."""
-    from jaxslam.config import Params, default_params
-    from jaxslam.learn import default_names
+    from jaxslam import learn, likelihood
+    from jaxslam.config import default_params
     from jaxslam.paramfile import Learning, load_learning
 
     base = default_params(config.sensor, train[0])
@@ -191,22 +193,25 @@ def _task(train, config, path, parameters):
         if default_params(config.sensor, log) != base:
             warn(f"{log.name}: declares other values than {train[0].name}, whose are used")
             break
-    task = load_learning(path, base) if path else Learning(base, None, {}, {})
-    names = task.names
+    told = load_learning(path, base) if path else Learning(base, None, {}, {})
+    start, names = told.params, told.names
     if parameters:
         names = tuple(name.strip() for name in parameters.split(","))
-        for name in names:
-            if name not in Params._fields:
-                raise ValueError(f"--parameters: {name!r} is no parameter")
-    names = names or default_names(config)
-    start = task.params
+    if names is None:  # what starts at 0 has no logarithm; who wants it learnt names it
+        names = learn.default_names(config)
+        names = tuple(n for n in names if getattr(start, n) > 0 or n in learn.SCALE)
+    if len(set(names)) < len(names):
+        raise ValueError(f"--parameters: {', '.join(names)}; name each once")
+    with _bias_told_later():
+        likelihood.check(config, names=names)
     if "sigma_bearing" in names and start.caution:
         note(f"caution, {start.caution:g} rad, becomes a part of sigma_bearing: it is learnt")
-        whole_noise = (start.sigma_bearing**2 + start.caution**2) ** 0.5
-        start = start._replace(sigma_bearing=whole_noise, caution=0.0)
+        both = (start.sigma_bearing**2 + start.caution**2) ** 0.5
+        start = start._replace(sigma_bearing=both, caution=0.0)
+    learn.taken(start, names)  # refuses a start at 0
     mine = [
         {name: pair for name, pair in pairs.items() if name in names}
-        for pairs in (task.bounds, task.priors)
+        for pairs in (told.bounds, told.priors)
     ]
     return Learning(start, names, *mine)
 

@@ -6,6 +6,7 @@ seen has a size: `growth`); either with a share `outlier` of measurements from a
 (heavy-tailed). Evidences of one log are comparable only as densities of the same thing: that of a
 point (x, y) is per m^2, that of (range, bearing) per m rad, and r times as large, since
 dx dy = r dr dbearing. The sum of log r over the measurements is added to the former.
+Of a point's covariance only the scale is learnt: it is made with the noise that the fit began with.
 """
 
 import dataclasses

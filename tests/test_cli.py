@@ -16,7 +16,7 @@ from small_run import make_refined
 from jaxslam import cli, compare, console, report, runner, simulate, variants
 from jaxslam.log import load_log, save_log
 
-COMMANDS = ("demo", "run", "compare", "convert", "check", "evaluate", "plot")
+COMMANDS = ("demo", "run", "compare", "convert", "check", "evaluate", "plot", "learn")
 MANY = ("--particles", "50", "--no-refine")
 
 
