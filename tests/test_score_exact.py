@@ -5,10 +5,14 @@ sum of Kalman filters over all of them. Both E[Zhat] = Z and the identity are ex
 of four particles the mean of Zhat (score - grad log Z) is zero, for the right score alone.
 """
 
+import runpy
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import test_exact
 from test_proposal import enumerated
 
 from jaxslam import association, likelihood
@@ -171,3 +175,20 @@ def test_without_the_associations_score_the_informed_proposal_is_rejected(
 ):
     z, _ = off_by(oracle, "informed", "fisher", FULL)
     assert np.abs(z[:-1]).max() > 8 and abs(z[-1]) < 4
+
+
+def test_the_experiments_kalman_filter_is_the_other_one(x64):
+    experiment = runpy.run_path(str(Path(__file__).parents[1] / "experiments" / "gradients.py"))
+    odometry, measurements, params = test_exact.problem()
+    data = likelihood.Data(test_exact.START, test_exact.START_COV, odometry, measurements)
+    gain, scale = 1.1, 1.3
+    area = (params.view_max - params.view_min) * params.view_range**2 / 2
+    log_z, _ = test_exact.kalman(
+        odometry._replace(dx=gain * odometry.dx, dy=gain * odometry.dy),
+        measurements._replace(cov=scale**2 * measurements.cov),
+        params,
+    )
+    given = params._replace(gain_tran=gain, position_scale=scale)
+    found = experiment["kalman"](given, jax.tree.map(jnp.asarray, data), test_exact.LANDMARKS)
+    expected = log_z - test_exact.STEPS * params.density_new * area
+    assert float(found) == pytest.approx(expected, rel=1e-12)
