@@ -22,7 +22,9 @@ class Config:
     `resample_threshold` t: resample when ESS < t * particles (0: never, 1 or more: every frame).
     `exclusive`: two measurements of one frame never share a landmark. `clutter`: a measurement may
     come from nothing. `forgetting`: landmarks carry an existence log-odds and are freed below zero
-    (None: on, unless identities are known). `block`: particles worked on at once, so that
+    (None: on, unless identities are known). `even`: of n landmarks in view each is as likely
+    beforehand to be the one measured, so that a match counts 1 / n; without it a landmark held
+    twice would be twice as likely (`sampled` only). `block`: particles worked on at once, so that
     temporaries stay in cache; it changes the speed, never the result.
 
     Raises `ValueError` for a value that is not allowed.
@@ -38,6 +40,7 @@ class Config:
     clutter: bool = True
     forgetting: bool | None = None
     proposal: str = "prior"
+    even: bool = False
     block: int = 512
 
     def __post_init__(self):
@@ -58,9 +61,12 @@ class Config:
             raise ValueError(f"Config.resample_threshold: {threshold!r} is not a number >= 0")
         if self.forgetting is None:
             object.__setattr__(self, "forgetting", self.association != "known")
-        for name in ("exclusive", "clutter", "forgetting"):
+        for name in ("exclusive", "clutter", "forgetting", "even"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"Config.{name}: {getattr(self, name)!r} is not true or false")
+
+        if self.even and self.association != "sampled":
+            raise ValueError(f"Config.even: is for association sampled, not {self.association}")
 
     @classmethod
     def paper(cls, particles=1000, landmarks=64, measurements=16, **changes):

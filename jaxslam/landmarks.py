@@ -201,17 +201,19 @@ def _whiten(seen, value, cov, params):
     return (v0, v1 - share * v0), (first, rest), (xx, yy - share * xy)
 
 
+def in_view(seen, params):
+    """Whether what is predicted lies in the declared view."""
+    inside = (seen.bearing >= params.view_min) & (seen.bearing <= params.view_max)
+    return inside & (seen.range < params.view_range)
+
+
 def existence(world, seen, params):
     """Log-odds after a frame: matched raises, expected and unseen lowers; below zero is freed.
 
     `world` is the map after `update_matched`, with its marks; `seen` the prediction from before.
     The chance of being seen falls linearly with range, to zero at the declared maximum.
     """
-    expected = (
-        (seen.bearing >= params.view_min)
-        & (seen.bearing <= params.view_max)
-        & (seen.range < params.view_range)
-    )
+    expected = in_view(seen, params)
     chance = params.detection * jnp.maximum(0.0, 1 - seen.range / params.view_range)
     raised = jnp.minimum(world.log_odds + params.existence_seen, params.existence_max)
     lowered = world.log_odds + params.existence_miss * jnp.log1p(-chance)

@@ -346,7 +346,7 @@ def motion_score(u, odometry, params, names):
     def density(values):
         return motion.log_density_of(u, odometry, params._replace(**values), params)
 
-    return jax.jacfwd(density)({name: getattr(params, name) for name in names})
+    return jax.jacfwd(density)({name: getattr(params, name) for name in names}) if names else {}
 
 
 def alternatives_score(match, params):

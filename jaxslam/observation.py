@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.scipy.special import gammaln
 
 from jaxslam import association, geometry, landmarks, motion, proposal, sensors
 from jaxslam.association import CLUTTER, NEW
@@ -111,7 +112,9 @@ def _look(particles, before, odometry, measurements, params, number, config, hol
     if informed:
         axes = proposal.axes(pose, predicted, sensor_pose, odometry, params)
         by_u = proposal.rows(sensor, sensor_pose, axes, before.mean, anchor, seen.value)
-    scorer = landmarks.scorer(sensor, seen, before, jnp.log1p(-params.outlier), by_u)
+    count = (landmarks.in_view(seen, params) & (before.count > 0)).sum(0) if config.even else 1
+    inlier = jnp.log1p(-params.outlier) - jnp.log(jnp.maximum(count, 1))
+    scorer = landmarks.scorer(sensor, seen, before, inlier, by_u)
     new = sensors.log_new_density(sensor, tuple(measurements.value.T), params)
     clutter = sensors.log_clutter_density(sensor, params)
     match, log_choice = association.associate(
@@ -129,6 +132,8 @@ def _look(particles, before, odometry, measurements, params, number, config, hol
     density = density + jnp.where(match == NEW, new[:, None], 0).sum(0)
     if config.clutter:
         density = density + jnp.where(match == CLUTTER, clutter, 0).sum(0)
+    if config.even:
+        density = density - _orders(count, (match >= 0).sum(0))
     world, overflow = landmarks.create(
         config, tuple(sensor_pose), world, match, measurements, params, number
     )
@@ -139,3 +144,9 @@ def _look(particles, before, odometry, measurements, params, number, config, hol
     density = density + log_ratio - log_choice
     world = landmarks.settle(world)
     return Observed(predicted, world, density, match, log_choice, counts, u)
+
+
+def _orders(count, matched):
+    """Log of in how many ways as many landmarks as `matched` [n] are picked from `count` [n]."""
+    count = jnp.maximum(count, matched) + 1.0
+    return gammaln(count) - gammaln(count - matched)

@@ -3,6 +3,8 @@
 import jax
 import jax.numpy as jnp
 
+AT_ONCE = 4096  # elements: a round of a loop costs as much as some hundred of them
+
 
 def systematic(log_weight, uniform):
     """Ancestors [N] (int32) for log weights [N] and one uniform draw in [0, 1).
@@ -29,17 +31,23 @@ def systematic(log_weight, uniform):
 def gather(tree, ancestors, wanted):
     """Every leaf [..., N] with its last axis taken at `ancestors`, if `wanted`.
 
-    Row by row and in place: a row fits the cache, while a whole `take` would need a second copy of
-    the map and run at a fraction of the speed. Unwanted is a loop of no rounds, where a `cond`
-    would copy the map.
+    A few rows at a time and in place: they fit the cache, while a whole `take` would need a second
+    copy of the map and run at a fraction of the speed. Unwanted is a loop of no rounds, where a
+    `cond` would copy the map.
     """
 
-    def one(i, rows):
-        row = jax.lax.dynamic_index_in_dim(rows, i, keepdims=False)
-        return jax.lax.dynamic_update_index_in_dim(rows, row[ancestors], i, 0)
+    def one(i, parts):
+        part = jax.lax.dynamic_index_in_dim(parts, i, keepdims=False)
+        return jax.lax.dynamic_update_index_in_dim(parts, part[:, ancestors], i, 0)
 
     def gather_leaf(leaf):
-        rows = leaf.reshape(-1, leaf.shape[-1])
-        return jax.lax.fori_loop(0, jnp.where(wanted, len(rows), 0), one, rows).reshape(leaf.shape)
+        if leaf.size == 0:
+            return leaf
+        rows = leaf.size // leaf.shape[-1]
+        some = max(1, min(rows, AT_ONCE // leaf.shape[-1]))
+        some = next(size for size in range(some, 0, -1) if rows % size == 0)
+        parts = leaf.reshape(-1, some, leaf.shape[-1])
+        rounds = jnp.where(wanted, len(parts), 0)
+        return jax.lax.fori_loop(0, rounds, one, parts).reshape(leaf.shape)
 
     return jax.tree.map(gather_leaf, tree)

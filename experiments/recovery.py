@@ -1,0 +1,203 @@
+"""Are the intervals of learnt parameters honest? 100 simulated logs, each learnt on its own.
+
+Truths are drawn from a prior; every log is learnt from a start that is a factor e (for gains: 0.2)
+off in every parameter, up or down at random; then the standard errors are estimated. Over all logs
+and the parameters that each log resolves: the share of 95 % intervals that cover the truth, and the
+root mean square of (estimate - truth) / standard error.
+
+    python experiments/recovery.py --case bearing     # bearings, identities known
+    python experiments/recovery.py --case hidden      # ranges and bearings, identities hidden
+
+All logs are worked on in one compiled program, on as many CPU devices as there are cores. Writes
+experiments/results/recovery_CASE.csv; a run that was cut off goes on from its .npz.
+"""
+
+import argparse
+import csv
+import os
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from jaxslam import learn, likelihood, simulate, uncertainty
+from jaxslam.atomic import replacing
+from jaxslam.config import Config, Params, default_params
+
+RESULTS = Path(__file__).parent / "results"
+NOISE = {
+    "err_tran": (0.05, 0.4),
+    "err_drift": (0.05, 0.4),
+    "sigma_bearing": (0.03, 0.4),
+    "sigma_range": (0.1, 0.4),
+    "gain_rot": (1.0, 0.1),
+}  # median of the prior, and its standard deviation in logarithms
+CASES = {
+    "bearing": ("bearing", "known", ("err_tran", "err_drift", "sigma_bearing", "gain_rot")),
+    "hidden": ("range_bearing", "sampled", tuple(NOISE)),
+}
+STEPS, RATE, SEEDS = 45, 0.2, 4
+
+
+def world(case, number):
+    """A log, and the true values of what is learnt from it."""
+    names, rng = CASES[case][2], np.random.default_rng([2026, number])
+    truth = {n: NOISE[n][0] * float(np.exp(NOISE[n][1] * rng.standard_normal())) for n in NOISE}
+    log = simulate.planar(
+        "field", 1000 + number, landmarks=20, length_m=30, rate_hz=2.5, odometry_hz=12.5,
+        max_per_frame=8, closed_loop=False, outlier=0.01 if case == "hidden" else 0.0, **truth,
+    )  # fmt: skip
+    return log, np.array([truth[n] for n in names]), rng.choice([-1, 1], len(names))
+
+
+def problem(case, count):
+    """Stacked logs, configuration, parameters, names, true and starting free values [L, P]."""
+    sensor, association, names = CASES[case]
+    worlds = [world(case, number) for number in range(count)]
+    logs = [log for log, _, _ in worlds]
+    hidden = association == "sampled"
+    config = Config(
+        sensor=sensor, association=association, proposal="informed", particles=200, measurements=8,
+        landmarks=32 if hidden else 20, clutter=hidden, even=hidden,
+    )  # fmt: skip
+    params = default_params(sensor, logs[0])._replace(density_new=1e-3)
+    with jax.enable_x64(True):
+        true = np.array(
+            [[float(learn.to_free(n, v)) for n, v in zip(names, t, strict=True)]
+             for _, t, _ in worlds]
+        )  # fmt: skip
+    off = np.where([name.startswith("gain") for name in names], 0.2, 1.0)
+    return (
+        learn.stacked(logs, config, params),
+        config,
+        params,
+        names,
+        true,
+        true + off * np.array([sign for _, _, sign in worlds]),
+    )
+
+
+class Scores:
+    """Scores of all logs at once, each at its own free values."""
+
+    def __init__(self, data, config, params, names):
+        self.count = len(data.start_pose)
+        numbers = Params(*(jnp.asarray(v, data.start_pose.dtype) for v in params))
+        self.given, self.model = (numbers, data), (config, names)
+
+    def __call__(self, free, seeds, seed):
+        """`Score` with leading axes (logs, seeds), at `free` [L, P]."""
+        which = np.repeat(np.arange(self.count), seeds)
+        keys = jax.random.split(jax.random.key(seed), len(which))
+        found = learn.scores(
+            jnp.asarray(free[which], jnp.float32), *self.given, which, keys, *self.model,
+            likelihood.DISCOUNT,
+        )  # fmt: skip
+        return jax.tree.map(
+            lambda leaf: np.asarray(leaf, float).reshape(self.count, seeds, *leaf.shape[1:]), found
+        )
+
+
+def climbed(scores, start, saved):
+    """Free values [L, P] after Adam, the last iterates' mean. `saved`: a file to go on from."""
+    adam = optax.adam(optax.cosine_decay_schedule(RATE, STEPS, learn.LAST_RATE), 0.9, 0.99)
+    free, past, state = start, [], adam.init(jnp.asarray(start, jnp.float32))
+    leaves, shape = jax.tree.flatten(state)
+    if saved.exists():
+        with np.load(saved) as file:
+            past = list(file["past"])
+            free = file["free"]
+            leaves = [jnp.asarray(file[f"leaf{i}"]) for i in range(len(leaves))]
+            state = jax.tree.unflatten(shape, leaves)
+    begin = time.perf_counter()
+    for step in range(len(past), STEPS):
+        score = scores(free, 1, 10_000 + step).total[:, 0]
+        move, state = adam.update(-jnp.nan_to_num(jnp.asarray(score, jnp.float32)), state)
+        past.append(free)
+        free = free + np.asarray(move, float)
+        with replacing(saved) as file:
+            leaves = {f"leaf{i}": np.asarray(v) for i, v in enumerate(jax.tree.leaves(state))}
+            np.savez(file, past=np.array(past), free=free, **leaves)
+        spent = time.perf_counter() - begin
+        print(f"step {step + 1}/{STEPS}, {spent:.0f} s", file=sys.stderr, flush=True)
+    last = round(learn.TAIL * STEPS)
+    return np.mean([*past[-last + 1 :], free], 0)
+
+
+def assessed(scores, free):
+    """Free values after a Newton step, standard errors [L, P], how they were made, scores, and
+    standard errors by other ways."""
+    found = scores(free, SEEDS, 1)
+    outers = np.array([uncertainty.outer_products(s[None]) for s in found.steps])
+    widths = np.array([uncertainty.half_widths(outer) for outer in outers])
+    sides = []
+    for i in range(free.shape[1]):
+        step = np.zeros_like(free)
+        step[:, i] = widths[:, i]
+        sides.append([scores(free + sign * step, SEEDS, 1).total for sign in (-1, 1)])
+        print(f"slope {i + 1}/{free.shape[1]}", file=sys.stderr, flush=True)
+    low, high = np.moveaxis(np.array(sides), (1, 2), (0, 1))  # [2, L, P, S, P]
+    curves = [uncertainty.curved(*one) for one in zip(low, high, widths, strict=True)]
+    slopes = np.array([slope for slope, _ in curves])
+    parts = [uncertainty.combined(outer, *one) for outer, one in zip(outers, curves, strict=True)]
+    covariance = np.array([part[0] for part in parts])
+    information = np.array(
+        [o if part[2] == "outer" else (o + s) / 2
+         for o, s, part in zip(outers, slopes, parts, strict=True)]
+    )  # fmt: skip
+    move = [uncertainty.newton(i, t) for i, t in zip(information, found.total.mean(1), strict=True)]
+    error = np.sqrt(np.einsum("lpp->lp", covariance))
+    by = {"outer": outers, "curvature": slopes, "pooled": information}
+    errors = {k: np.sqrt([np.diag(uncertainty.inverted(m)) for m in v]) for k, v in by.items()}
+    return free + move, error, parts, found, errors
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--case", choices=CASES, required=True)
+    parser.add_argument("--logs", type=int, default=100)
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    args = parser.parse_args()
+    jax.config.update("jax_num_cpu_devices", os.cpu_count())
+    *given, true, start = problem(args.case, args.logs)
+    data, config, params, names = given
+    scores = Scores(data, config, params, names)
+    free = climbed(scores, start, args.out / f"recovery_{args.case}_{args.logs}.npz")
+    estimate, error, parts, found, errors = assessed(scores, free)
+    agreement = np.array([part[1] for part in parts])
+    resolved = error < uncertainty.OPEN
+    z = (estimate - true) / error
+    name = args.out / f"recovery_{args.case}.csv"
+    with open(name, "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["log", "parameter", "true", "start", "estimate", "standard_error",
+                         "agreement", "made", "resolved", "z"])  # fmt: skip
+        for i, p in np.ndindex(*true.shape):
+            row = (true[i, p], start[i, p], estimate[i, p], error[i, p], agreement[i, p])
+            writer.writerow([i, names[p], *(f"{v:.4f}" for v in row), parts[i][2],
+                             int(resolved[i, p]), f"{z[i, p]:.3f}"])  # fmt: skip
+    print("parameter        resolved  covered   RMS z  mean z  median error  outer/curvature")
+    for p, label in [*enumerate(names), (slice(None), "all")]:
+        good, score = resolved[:, p], z[:, p][resolved[:, p]]
+        print(f"{label:16s} {good.sum():8d} {100 * np.mean(np.abs(score) < 1.96):7.1f}% "
+              f"{np.sqrt(np.mean(score**2)):7.2f} {score.mean():7.2f} "
+              f"{np.median(error[:, p][good]):13.3f} "
+              f"{np.median(agreement[:, p][good]):16.2f}")  # fmt: skip
+    for kind, other in errors.items():
+        score = ((estimate - true) / other)[resolved]
+        print(f"with errors by {kind}: covered {100 * np.mean(np.abs(score) < 1.96):.1f}%, "
+              f"RMS z {np.sqrt(np.mean(score**2)):.2f}")  # fmt: skip
+    before = ((free - true) / error)[resolved]
+    print(f"before the Newton step: RMS z {np.sqrt(np.mean(before**2)):.2f}")
+    spread = np.median(found.log_likelihood.std(1, ddof=1))
+    print(f"standard deviation of log Z over seeds, median of the logs: {spread:.2f} nats")
+    made = [part[2] for part in parts]
+    print("errors made by", ", ".join(f"{made.count(k)} {k}" for k in sorted(set(made))))
+
+
+if __name__ == "__main__":
+    main()
