@@ -83,16 +83,19 @@ def learn(
     _check_apart(logs, (start, end), held_out, (held_out_start, held_out_end))
     _use_all_cores()
     with bar("reading"):
-        train = _windows(logs, start, end, window)
-        judges = _windows(held_out, held_out_start, held_out_end, window)
+        known = association == "known"
+        train = _windows(logs, start, end, window, known)
+        judges = _windows(held_out, held_out_start, held_out_end, window, known)
         config, dropped = _config(train + judges, sensor, association, particles, landmarks)
         task = _task(train, config, params, parameters)
         pair = _pair(surface, task.names)
     out.parent.mkdir(parents=True, exist_ok=True)
     fit = _fitted(train, judges, config, task, seeds, steps, seed, files, resume)
     errors, judged = _assessed(fit, train, judges, seed)
-    drawn = _written(fit, errors, task, train, pair, files, seed)
-    found = _told(fit, errors, judged, dropped, drawn)
+    _write(fit, errors, task, files)
+    found = _told(fit, errors, judged, dropped, files)
+    if pair:
+        _draw_surface(train, fit, errors, pair, files["surface"], seed)
     if compare_models:
         found |= _models(train, judges, fit, seeds, steps, seed)
     files["checkpoint"].unlink(missing_ok=True)
@@ -144,8 +147,9 @@ def _use_all_cores():
         jax.config.update("jax_num_cpu_devices", cores)
 
 
-def _windows(names, start, end, seconds):
-    """The parts of the logs, in windows."""
+def _windows(names, start, end, seconds, known):
+    """The parts of the logs, in windows; those without identities left out where these are needed
+    and the log has some."""
     from jaxslam.cut import cut, windows
     from jaxslam.log import load_log
 
@@ -153,15 +157,18 @@ def _windows(names, start, end, seconds):
     for name in names:
         log = load_log(name)
         log = cut(log, start, end) if start or end is not None else log
-        parts += windows(log, seconds) if seconds else [log]
+        found = windows(log, seconds) if seconds else [log]
+        if known and log.identity is not None and (log.identity >= 0).any():
+            blind = [part for part in found if len(part.frame) and part.identity.max() < 0]
+            if blind:
+                warn(f"{log.name}: {len(blind)} windows without any identity are left out")
+            found = [part for part in found if part not in blind]
+        parts += found
     return parts
 
 
 def _config(parts, sensor, association, particles, landmarks):
-    """A `Config` with room for every part, and how many measurements it has no use for, by why.
-
-    Parts that hold measurements but no identity are left out of the list where these are needed.
-    """
+    """A `Config` with room for every part, and how many measurements it has no use for, by why."""
     import dataclasses
 
     from jaxslam.frames import frames
@@ -290,8 +297,8 @@ def _assessed(fit, train, judges, seed):
         return assess(fit, train, seed=seed + 1), judged
 
 
-def _written(fit, errors, task, train, pair, files, seed):
-    """Write everything; paths of the figures."""
+def _write(fit, errors, task, files):
+    """Write the parameters, the steps' table and their figure."""
     from jaxslam import learn_report
     from jaxslam.paramfile import save_params
 
@@ -299,30 +306,31 @@ def _written(fit, errors, task, train, pair, files, seed):
     # From the free scale and back, a value at its bound may be a rounding beyond it.
     at_bound = {n: min(max(getattr(fit.params, n), a), b) for n, (a, b) in task.bounds.items()}
     params = fit.params._replace(**at_bound)
-    drawn = [files["figure"]]
     with bar("writing"):
         save_params(files["params"], params, standard, task._replace(params=params))
         learn_report.save_csv(files["csv"], fit)
         learn_report.save_figure(learn_report.draw_learning(fit, errors), files["figure"])
-    if pair:
-        from jaxslam import surface
-
-        with bar("surface", compiles=True) as progress:
-            found = surface.surface(train, fit, errors, pair, seed=seed + 2, progress=progress)
-        learn_report.save_figure(surface.draw_surface(found, fit, errors), files["surface"])
-        drawn.append(files["surface"])
-    return [files["params"], files["csv"], *drawn]
 
 
-def _told(fit, errors, judged, dropped, written):
+def _draw_surface(train, fit, errors, pair, path, seed):
+    """Draw the likelihood over a pair of parameters."""
+    from jaxslam import learn_report, surface
+
+    with bar("surface", compiles=True) as progress:
+        found = surface.surface(train, fit, errors, pair, seed=seed + 2, progress=progress)
+    learn_report.save_figure(surface.draw_surface(found, fit, errors), path)
+    print(path)
+
+
+def _told(fit, errors, judged, dropped, files):
     """Print what was found; whether there were warnings."""
     from jaxslam import learn_report, likelihood
 
     print(learn_report.table(fit, errors))
     for line in learn_report.sentences(fit, errors, judged):
         print(line)
-    print(*written, sep="\n")
-    print(f"map with it: jaxslam run LOG --sensor {fit.config.sensor} --params {written[0]}")
+    print(files["csv"], files["figure"], files["params"], sep="\n")
+    print(f"map with it: jaxslam run LOG --sensor {fit.config.sensor} --params {files['params']}")
     if judged is None:
         note("no --held-out log: nothing says whether other logs get more likely, too")
     flags = learn_report.flags(fit, errors, judged, dropped)
@@ -330,6 +338,7 @@ def _told(fit, errors, judged, dropped, written):
         flags.append(likelihood.BIASED)
     for line in flags:
         warn(line)
+    sys.stdout.flush()  # what follows takes long
     return bool(flags)
 
 

@@ -16,7 +16,13 @@ from jaxslam.likelihood import DISCOUNT
 from jaxslam.plot import FILTER, LANDMARK, RECKONING, REFINED, STYLE, write_figure
 from jaxslam.uncertainty import MANY
 
-KNOWN = 3.0  # free scale: from here on a standard error is a figure without meaning
+KNOWN = 2.0  # free scale: from here on (a factor of 7) a standard error is without meaning
+MADE = {  # `uncertainty.combined`
+    "both": "products of the scores and their slope agree",
+    "outer": "from products of the scores; their slope is lost in the particles' noise",
+    "sandwich": "products of the scores and their slope disagree, as with a model that is not "
+    "quite right; they are the sandwich of both",
+}
 WIDE = 3.0  # an axis from x to this many times x is drawn logarithmic, where that is the free scale
 
 
@@ -59,6 +65,7 @@ def sentences(fit, errors, judged=None):
             f"held-out evidence: {_spread(judged.before)} before, {_spread(judged.after)} after, "
             f"difference {_spread(gain, '+')} nats ({len(gain)} fresh seeds)"
         )
+    lines.append(f"standard errors: {MADE[errors.made]}")
     share = np.max(errors.monte_carlo_error / np.maximum(errors.standard_error, 1e-300))
     lines.append(f"Monte-Carlo error: at most {share:.2g} of a standard error")
     lines.append(f"log Z of one log spreads by {errors.log_z_sd:.2f} nats over seeds")

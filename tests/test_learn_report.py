@@ -49,6 +49,7 @@ def make_errors(free_error=(0.1, 0.2, 9.0), **changes):
         outer=np.diag(1 / free_error**2),
         curvature=np.diag(1 / free_error**2),
         agreement=np.ones(3),
+        made="both",
         log_z_sd=0.5,
         discounts={0.9: np.array([0.0, 10.0, 0.0]), 0.97: np.zeros(3), 1.0: np.zeros(3)},
         verdict=("resolved", "resolved", "not resolved"),
@@ -79,6 +80,7 @@ def test_the_sentences():
     text = "\n".join(learn_report.sentences(make_fit(), make_errors(), judged))
     assert "all steps done (20 steps, 12 s)" in text
     assert "-11.00 ± 1.41 before, -5.00 ± 0.00 after, difference +6.00 ± 1.41 nats (2 fresh" in text
+    assert "standard errors: products of the scores and their slope agree" in text
     assert "Monte-Carlo error: at most 0.25 of a standard error" in text
     assert "log Z of one log spreads by 0.50 nats" in text
     # The score differs by 10, the information is 25: by 0.4, two standard errors.
