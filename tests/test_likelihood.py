@@ -281,3 +281,38 @@ def test_what_is_refused():
         likelihood.log_likelihood(params, log, KEY, config, "score")
     with pytest.raises(ValueError, match="has 6 frames, more than the 5 asked for"):
         likelihood.data_of(log, config, steps=5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensor", ["range_bearing", "bearing"])
+def test_the_mean_score_is_that_of_particles_that_are_never_resampled(x64, sensor):
+    """Where nothing is linear: E[Zhat score] is grad Z whatever proposes the poses.
+
+    Without resampling and draws of associations Zhat is smooth, and its own derivative is right.
+    """
+    params, data = among_marks(sensor, 3)
+    names = ("err_rot", "gain_tran", "sigma_bearing", "mount_x", "mount_yaw")
+
+    def runs(config, estimator, count):
+        def one(key):
+            found = likelihood.scored(params, data, key, config, names, estimator, 1.0)
+            return found.log_likelihood, found.total, found.min_ess
+
+        keys = jax.random.split(jax.random.key(3), count)
+        return jax.tree.map(
+            np.asarray, jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=500))(keys)
+        )
+
+    known = dict(clutter=False, landmarks=4)
+    few = config_of(sensor, "known", 4, resample_threshold=0.8, **known)
+    many = config_of(sensor, "known", 32, resample_threshold=0, **known | dict(proposal="prior"))
+    found, wanted = runs(few, "fisher", 20_000), runs(many, "plain", 5_000)
+    assert np.mean(found[2] < 0.8 * 4) > 0.5
+    scale = np.exp(wanted[0] - wanted[0].max()).mean()
+    ratio, right = (np.exp(one[0] - wanted[0].max()) / scale for one in (found, wanted))
+    slope = right @ wanted[1] / right.sum()
+    off = [w[:, None] * np.insert(one[1] - slope, 0, 1.0, 1)
+           for w, one in ((ratio, found), (right, wanted))]  # fmt: skip
+    error = np.sqrt(sum(part.var(0) / len(part) for part in off))
+    z = (off[0].mean(0) - off[1].mean(0)) / error
+    assert np.abs(z).max() < 4 and error.max() < 0.5
