@@ -46,9 +46,8 @@ def cut(log, start=0.0, end=None):
         start_pose=log.start_pose if first else _pose(log, begin),
         start_cov=log.start_cov if first else np.zeros((3, 3)),
         truth=_truth(log.truth, begin, stop, rows),
-        **{name: None if value is None else value[rows]
-           for name in PER_ROW for value in (getattr(log, name),)},
-    )  # fmt: skip
+        **_rows(log, rows),
+    )
 
 
 def windows(log, seconds):
@@ -66,6 +65,42 @@ def windows(log, seconds):
         if ((seen > (start or -1)) & (seen <= end)).any():
             pieces.append(cut(log, start, end))
     return pieces
+
+
+def spaced(log, seconds):
+    """The log with only frames that are `seconds` apart or more (0: all); odometry stays whole.
+
+    Errors of frames in quick succession are alike, which a filter, and more so learning, takes for
+    precision. What is left out is not counted as `skipped`.
+    """
+    if not (np.isfinite(seconds) and seconds >= 0):
+        raise ValueError(f"frames {seconds} s apart; must be 0 or more")
+    kept, last = np.zeros(len(log.frame_time), bool), None
+    for i, stamp in enumerate(log.frame_time.tolist()):
+        if last is None or stamp - last >= seconds * S:
+            kept[i], last = True, stamp
+    return _only(log, kept)
+
+
+def _only(log, frames):
+    """The log with those frames [F] (bool) and their measurements."""
+    rows = frames[log.frame]
+    truth = log.truth
+    if truth is not None and truth.identity is not None:
+        truth = dataclasses.replace(truth, identity=truth.identity[rows])
+    return dataclasses.replace(
+        log,
+        frame_time=log.frame_time[frames],
+        frame=(np.cumsum(frames) - 1)[log.frame[rows]],
+        truth=truth,
+        **_rows(log, rows),
+    )
+
+
+def _rows(log, rows):
+    """The log's columns of those measurements [n] (bool)."""
+    columns = {name: getattr(log, name) for name in PER_ROW}
+    return {name: None if value is None else value[rows] for name, value in columns.items()}
 
 
 def _length(log):
