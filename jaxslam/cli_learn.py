@@ -51,6 +51,9 @@ def learn(
     particles: whole("how many hypotheses of the path") = 200,
     landmarks: whole("slots of the map (64; known: one each)") | None = None,
     window: option(float, "logs are learnt in pieces so long [s] (0: whole)") = 60.0,
+    spacing: option(
+        float, "use frames at least so far apart [s]: errors of close ones are alike"
+    ) = 0.0,
     start: Start = 0.0,
     end: End = None,
     held_out_start: Start = 0.0,
@@ -84,8 +87,8 @@ def learn(
     _use_all_cores()
     with bar("reading"):
         known = association == "known"
-        train = _windows(logs, start, end, window, known)
-        judges = _windows(held_out, held_out_start, held_out_end, window, known)
+        train = _windows(logs, start, end, window, spacing, known)
+        judges = _windows(held_out, held_out_start, held_out_end, window, spacing, known)
         config, dropped = _config(train + judges, sensor, association, particles, landmarks)
         task = _task(train, config, params, parameters)
         pair = _pair(surface, task.names)
@@ -147,16 +150,17 @@ def _use_all_cores():
         jax.config.update("jax_num_cpu_devices", cores)
 
 
-def _windows(names, start, end, seconds, known):
+def _windows(names, start, end, seconds, spacing, known):
     """The parts of the logs, in windows; those without identities left out where these are needed
     and the log has some."""
-    from jaxslam.cut import cut, windows
+    from jaxslam.cut import cut, spaced, windows
     from jaxslam.log import load_log
 
     parts = []
     for name in names:
         log = load_log(name)
         log = cut(log, start, end) if start or end is not None else log
+        log = spaced(log, spacing)
         found = windows(log, seconds) if seconds else [log]
         if known and log.identity is not None and (log.identity >= 0).any():
             blind = [part for part in found if len(part.frame) and part.identity.max() < 0]
@@ -174,7 +178,8 @@ def _config(parts, sensor, association, particles, landmarks):
     from jaxslam.frames import frames
     from jaxslam.runner import config_for
 
-    told = {"particles": particles} | ({"landmarks": landmarks} if landmarks else {})
+    told = {"particles": particles, "even": association == "sampled"}
+    told |= {"landmarks": landmarks} if landmarks else {}
     made = [config_for(part, sensor, association, proposal="informed", **told) for part in parts]
     config = dataclasses.replace(
         made[0],
@@ -324,18 +329,16 @@ def _draw_surface(train, fit, errors, pair, path, seed):
 
 def _told(fit, errors, judged, dropped, files):
     """Print what was found; whether there were warnings."""
-    from jaxslam import learn_report, likelihood
+    from jaxslam import learn_report
 
     print(learn_report.table(fit, errors))
     for line in learn_report.sentences(fit, errors, judged):
         print(line)
     print(files["csv"], files["figure"], files["params"], sep="\n")
     print(f"map with it: jaxslam run LOG --sensor {fit.config.sensor} --params {files['params']}")
-    if judged is None:
-        note("no --held-out log: nothing says whether other logs get more likely, too")
+    for line in learn_report.advice(fit, errors, judged):
+        note(line)
     flags = learn_report.flags(fit, errors, judged, dropped)
-    if fit.config.association == "maximum_likelihood":
-        flags.append(likelihood.BIASED)
     for line in flags:
         warn(line)
     sys.stdout.flush()  # what follows takes long

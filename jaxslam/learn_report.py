@@ -12,7 +12,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from jaxslam.atomic import replacing
 from jaxslam.config import UNITS
 from jaxslam.learn import TRANSFORM, from_free
-from jaxslam.likelihood import DISCOUNT
+from jaxslam.likelihood import BIASED, DISCOUNT
 from jaxslam.plot import FILTER, LANDMARK, RECKONING, REFINED, STYLE, write_figure
 from jaxslam.uncertainty import MANY
 
@@ -89,8 +89,7 @@ def moved(errors, discount):
 
 
 def flags(fit, errors, judged=None, dropped=None):
-    """Lines on what went wrong: rows lost, numbers not finite, particles too few, worse than
-    before."""
+    """Lines on what went wrong: rows lost, numbers not finite."""
     lines = [f"{count} measurements not used: {why}" for why, count in (dropped or {}).items()]
     lost = int((~np.isfinite(fit.history.gradient_norm)).sum())
     if lost:
@@ -98,13 +97,25 @@ def flags(fit, errors, judged=None, dropped=None):
     bad = [n for n, e in zip(fit.names, errors.standard_error, strict=True) if not np.isfinite(e)]
     if bad:
         lines.append(f"the standard error is not finite: {', '.join(bad)}")
+    if judged is not None and not np.isfinite([*judged.before, *judged.after]).all():
+        lines.append("held-out evidence is not finite")
+    return lines
+
+
+def advice(fit, errors, judged=None):
+    """Lines on what to distrust, though nothing was lost."""
+    lines = []
     if not errors.log_z_sd <= MANY:
         lines.append(
             f"log Z of one log spreads by {errors.log_z_sd:.2g} nats over seeds, above {MANY:g}: "
             "more --particles or a shorter --window"
         )
-    if judged is not None and not np.mean(judged.after - judged.before) >= 0:
+    if judged is None:
+        lines.append("no --held-out log: nothing says whether other logs get more likely, too")
+    elif not np.mean(judged.after - judged.before) >= 0:
         lines.append("the held-out logs got less likely: keep what you had")
+    if fit.config.association == "maximum_likelihood":
+        lines.append(BIASED)
     return lines
 
 

@@ -176,16 +176,17 @@ def test_what_is_lost_or_worse_is_a_warning(logs, call, drives, monkeypatch):
     )
     code, _, err = call(*known, "--held-out", "b.npz", "--overwrite", "--start", "1")
     assert code == 1
-    assert "the held-out logs got less likely" in err
+    assert "warning: held-out evidence is not finite" in err
+    assert "note: the held-out logs got less likely" in err
 
 
 def test_windows_without_identities_are_left_out(logs, drives, capsys):
     early = drives[0].frame < 10  # 2 s
     save_log("a.npz", dataclasses.replace(drives[0], identity=np.where(early, -1, 7)))
-    parts = cli_learn._windows(["a.npz"], 0.0, None, 1.0, True)
+    parts = cli_learn._windows(["a.npz"], 0.0, None, 1.0, 0.0, True)
     assert [part.name[-8:] for part in parts] == ["2 to 3 s", "3 to 4 s"]
     assert "2 windows without any identity are left out" in capsys.readouterr().err
-    assert len(cli_learn._windows(["a.npz"], 0.0, None, 1.0, False)) == 4
+    assert len(cli_learn._windows(["a.npz"], 0.0, None, 1.0, 0.0, False)) == 4
 
 
 def test_caution_becomes_a_part_of_what_is_learnt():

@@ -183,3 +183,22 @@ def test_times_that_hold_nothing_are_refused(start, end, found):
 def test_a_window_of_no_length_is_refused(seconds):
     with pytest.raises(ValueError, match="must be above 0"):
         windows(ragged(), seconds)
+
+
+def test_frames_some_time_apart():
+    log = load_log("lost-in-the-woods")
+    part = spaced(log, 1.0)
+    gaps = np.diff(part.frame_time) * 1e-9
+    assert gaps.min() >= 1.0
+    assert gaps.max() < 1.2
+    kept = np.isin(log.frame_time[log.frame], part.frame_time)
+    np.testing.assert_array_equal(part.range, log.range[kept])
+    np.testing.assert_array_equal(part.frame_time[part.frame], log.frame_time[log.frame][kept])
+    np.testing.assert_array_equal(part.odometry, log.odometry)
+    # The same drive: what moves between two frames is all there.
+    assert increments(part).distance.sum() == pytest.approx(
+        increments(log).distance.sum(), rel=0.01
+    )
+    assert len(spaced(log, 0).frame) == len(log.frame)
+    with pytest.raises(ValueError, match="frames -1 s apart; must be 0 or more"):
+        spaced(log, -1)

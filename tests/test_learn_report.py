@@ -94,16 +94,14 @@ def test_the_sentences():
 def test_nothing_wrong_no_warning():
     judged = Judged(np.zeros(2), np.ones(2))
     assert learn_report.flags(make_fit(), make_errors(), judged, {}) == []
+    assert learn_report.advice(make_fit(), make_errors(), judged) == []
 
 
 @pytest.mark.parametrize(
     ("changes", "found"),
     [
         ({"dropped": {"no identity": 7}}, "7 measurements not used: no identity"),
-        ({"judged": Judged(np.ones(2), np.zeros(2))}, "the held-out logs got less likely"),
-        ({"judged": Judged(np.ones(2), np.full(2, np.nan))}, "the held-out logs got less likely"),
-        ({"errors": make_errors(log_z_sd=2.0)}, "spreads by 2 nats over seeds, above 1.5"),
-        ({"errors": make_errors(log_z_sd=np.nan)}, "spreads by nan nats"),
+        ({"judged": Judged(np.ones(2), np.full(2, np.nan))}, "held-out evidence is not finite"),
         ({"errors": make_errors((0.1, np.nan, 1))}, "error is not finite: sigma_bearing"),
         ({"fit": make_fit(gradient_norm=np.append(np.nan, np.ones(19)))}, "in 1 of 20 steps"),
     ],
@@ -111,6 +109,22 @@ def test_nothing_wrong_no_warning():
 def test_what_went_wrong_is_a_warning(changes, found):
     given = {"fit": make_fit(), "errors": make_errors()} | changes
     (line,) = learn_report.flags(**given)
+    assert found in line
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"judged": None}, "nothing says whether other logs get more likely"),
+        ({"judged": Judged(np.ones(2), np.zeros(2))}, "the held-out logs got less likely"),
+        ({"judged": Judged(np.ones(2), np.full(2, np.nan))}, "the held-out logs got less likely"),
+        ({"errors": make_errors(log_z_sd=2.0)}, "spreads by 2 nats over seeds, above 1.5"),
+        ({"errors": make_errors(log_z_sd=np.nan)}, "spreads by nan nats"),
+    ],
+)
+def test_what_to_distrust_is_advice(changes, found):
+    given = {"fit": make_fit(), "errors": make_errors(), "judged": Judged(np.zeros(2), np.ones(2))}
+    (line,) = learn_report.advice(**given | changes)
     assert found in line
 
 
