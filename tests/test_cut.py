@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxslam import simulate
-from jaxslam.cut import PER_ROW, cut, windows
+from jaxslam.cut import PER_ROW, cut, spaced, windows
 from jaxslam.evaluate import truth_at
 from jaxslam.log import Log, Truth, load_log, save_log
 from jaxslam.odometry import increments
