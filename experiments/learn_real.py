@@ -92,7 +92,7 @@ def learnt(case, seed, steps):
                   f"loss {record['loss']:.3f} {values}", file=sys.stderr, flush=True)  # fmt: skip
 
     fit = learn.fit(
-        parts, config, start, NAMES, held_out=judged, seeds=2, steps=steps, rate=0.15,
+        parts, config, start, NAMES, held_out=judged, seeds=2 if len(parts) < 3 else 1, batch=3, steps=steps, rate=0.15,
         every=15, held_out_seeds=2, seed=seed, progress=tell,
     )  # fmt: skip
     return fit, judged, parts
@@ -117,7 +117,7 @@ def judge(case, params, seeds):
 def assessed(case, steps, seeds):
     """What is written of a case: values, errors, evidence and map errors."""
     fit, judged, parts = learnt(case, 0, steps)
-    found = uncertainty.assess(fit, parts, seeds=3)
+    found = uncertainty.assess(fit, parts, seeds=2)
     known = {n: float(e) for n, e, f in zip(fit.names, found.standard_error, found.free_error,
                                             strict=True) if f < uncertainty.OPEN}  # fmt: skip
     PARAMS.mkdir(exist_ok=True)
