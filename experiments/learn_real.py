@@ -92,7 +92,8 @@ def learnt(case, seed, steps):
                   f"loss {record['loss']:.3f} {values}", file=sys.stderr, flush=True)  # fmt: skip
 
     fit = learn.fit(
-        parts, config, start, NAMES, held_out=judged, seeds=2 if len(parts) < 3 else 1, batch=3, steps=steps, rate=0.15,
+        parts, config, start, NAMES, held_out=judged, seeds=2 if len(parts) < 3 else 1,
+        batch=3, steps=steps, rate=0.15,
         every=15, held_out_seeds=2, seed=seed, progress=tell,
     )  # fmt: skip
     return fit, judged, parts

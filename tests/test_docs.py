@@ -19,7 +19,8 @@ from jaxslam.config import (
 )
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("docs/equations.md", "docs/algorithm.md", "docs/images.md", "docs/smoothing.md")
+PAGES = ("equations", "algorithm", "images", "smoothing", "gradients")
+PAGES = tuple(f"docs/{name}.md" for name in PAGES)
 REFERENCE = re.compile(r"`([\w./-]+\.py):([\w.]+)`")
 
 
