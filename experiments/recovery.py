@@ -9,7 +9,7 @@ root mean square of (estimate - truth) / standard error.
     python experiments/recovery.py --case hidden      # ranges and bearings, identities hidden
 
 All logs are worked on in one compiled program, on as many CPU devices as there are cores. Writes
-experiments/results/recovery_CASE.csv; a run that was cut off goes on from its .npz.
+experiments/results/recovery_CASE.csv and .txt; a run that was cut off goes on from its .npz.
 """
 
 import argparse
@@ -180,23 +180,36 @@ def main():
             row = (true[i, p], start[i, p], estimate[i, p], error[i, p], agreement[i, p])
             writer.writerow([i, names[p], *(f"{v:.4f}" for v in row), parts[i][2],
                              int(resolved[i, p]), f"{z[i, p]:.3f}"])  # fmt: skip
-    print("parameter        resolved  covered   RMS z  mean z  median error  outer/curvature")
+    lines = [*summary(names, (free, estimate, true), error, parts, found, errors)]
+    (args.out / f"recovery_{args.case}.txt").write_text("\n".join(lines) + "\n")
+    print(*lines, sep="\n")
+
+
+def summary(names, values, error, parts, found, errors):
+    """Lines: coverage and z by parameter, and with standard errors made in other ways."""
+    free, estimate, true = values
+    resolved = error < uncertainty.OPEN
+    z, agreement = (estimate - true) / error, np.array([part[1] for part in parts])
+    yield "parameter        resolved  covered   RMS z  mean z  median error  outer/curvature"
     for p, label in [*enumerate(names), (slice(None), "all")]:
         good, score = resolved[:, p], z[:, p][resolved[:, p]]
-        print(f"{label:16s} {good.sum():8d} {100 * np.mean(np.abs(score) < 1.96):7.1f}% "
-              f"{np.sqrt(np.mean(score**2)):7.2f} {score.mean():7.2f} "
-              f"{np.median(error[:, p][good]):13.3f} "
-              f"{np.median(agreement[:, p][good]):16.2f}")  # fmt: skip
+        yield (
+            f"{label:16s} {good.sum():8d} {100 * np.mean(np.abs(score) < 1.96):7.1f}% "
+            f"{np.sqrt(np.mean(score**2)):7.2f} {score.mean():7.2f} "
+            f"{np.median(error[:, p][good]):13.3f} {np.median(agreement[:, p][good]):16.2f}"
+        )
     for kind, other in errors.items():
         score = ((estimate - true) / other)[resolved]
-        print(f"with errors by {kind}: covered {100 * np.mean(np.abs(score) < 1.96):.1f}%, "
-              f"RMS z {np.sqrt(np.mean(score**2)):.2f}")  # fmt: skip
+        yield (
+            f"with errors by {kind}: covered {100 * np.mean(np.abs(score) < 1.96):.1f}%, "
+            f"RMS z {np.sqrt(np.mean(score**2)):.2f}"
+        )
     before = ((free - true) / error)[resolved]
-    print(f"before the Newton step: RMS z {np.sqrt(np.mean(before**2)):.2f}")
+    yield f"before the Newton step: RMS z {np.sqrt(np.mean(before**2)):.2f}"
     spread = np.median(found.log_likelihood.std(1, ddof=1))
-    print(f"standard deviation of log Z over seeds, median of the logs: {spread:.2f} nats")
+    yield f"standard deviation of log Z over seeds, median of the logs: {spread:.2f} nats"
     made = [part[2] for part in parts]
-    print("errors made by", ", ".join(f"{made.count(k)} {k}" for k in sorted(set(made))))
+    yield "errors made by " + ", ".join(f"{made.count(k)} {k}" for k in sorted(set(made)))
 
 
 if __name__ == "__main__":
