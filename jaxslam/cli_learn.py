@@ -178,8 +178,7 @@ def _config(parts, sensor, association, particles, landmarks):
     from jaxslam.frames import frames
     from jaxslam.runner import config_for
 
-    told = {"particles": particles, "even": association == "sampled"}
-    told |= {"landmarks": landmarks} if landmarks else {}
+    told = {"particles": particles} | ({"landmarks": landmarks} if landmarks else {})
     made = [config_for(part, sensor, association, proposal="informed", **told) for part in parts]
     config = dataclasses.replace(
         made[0],
