@@ -25,8 +25,8 @@ import jax
 import numpy as np
 
 from jaxslam import config_for, default_params, learn, load_log, run, save_params, uncertainty
-from jaxslam.cut import cut, spaced, windows
 from jaxslam.evaluate import errors
+from jaxslam.parts import cut, spaced, windows
 
 RESULTS = Path(__file__).parent / "results"
 PARAMS = Path(__file__).parent / "params"

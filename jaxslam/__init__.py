@@ -3,6 +3,7 @@
     log = jaxslam.load_log("lost-in-the-woods")
     result = jaxslam.run(log, seed=0)
     result.save("runs/woods")
+    fit = jaxslam.learn.fit([log], config, params, ["err_rot"])
 
 Names are looked up when first used, so that `import jaxslam` does not import JAX.
 """
@@ -19,6 +20,9 @@ _WHERE = {
     "Truth": "log",
     "FloorPlan": "log",
     "load_log": "log",
+    "cut": "parts",
+    "windows": "parts",
+    "spaced": "parts",
     "save_log": "log",
     "read": "readers",
     "config_for": "runner",
@@ -38,15 +42,18 @@ _WHERE = {
     "triangulate_log": "vision.points",
     "render_room": "render",
 }
+_MODULES = ("learn", "likelihood", "uncertainty")
 __version__ = "0.1.0"
-__all__ = sorted(_WHERE)
+__all__ = sorted([*_WHERE, *_MODULES])
 
 
 def __getattr__(name):
+    if name in _MODULES:
+        return importlib.import_module(f"jaxslam.{name}")
     if name not in _WHERE:
         raise AttributeError(f"module 'jaxslam' has no attribute {name!r}")
     return getattr(importlib.import_module(f"jaxslam.{_WHERE[name]}"), name)
 
 
 def __dir__():
-    return sorted([*globals(), *_WHERE])
+    return sorted([*globals(), *__all__])

@@ -108,8 +108,8 @@ def run(
     """
     with bar("reading"):
         from jaxslam import report, runner
-        from jaxslam.cut import cut
         from jaxslam.log import load_log
+        from jaxslam.parts import cut
 
         loaded, part = load_log(log), bool(start) or end is not None
         loaded = cut(loaded, start, end) if part else loaded

@@ -153,8 +153,8 @@ def _use_all_cores():
 def _windows(names, start, end, seconds, spacing, known):
     """The parts of the logs, in windows; those without identities left out where these are needed
     and the log has some."""
-    from jaxslam.cut import cut, spaced, windows
     from jaxslam.log import load_log
+    from jaxslam.parts import cut, spaced, windows
 
     parts = []
     for name in names:

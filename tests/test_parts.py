@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from jaxslam import simulate
-from jaxslam.cut import PER_ROW, cut, spaced, windows
 from jaxslam.evaluate import truth_at
 from jaxslam.log import Log, Truth, load_log, save_log
 from jaxslam.odometry import increments
+from jaxslam.parts import PER_ROW, cut, spaced, windows
 
 S, MS = 10**9, 10**6
 
