@@ -94,7 +94,7 @@ def learn(
         pair = _pair(surface, task.names)
     out.parent.mkdir(parents=True, exist_ok=True)
     fit = _fitted(train, judges, config, task, seeds, steps, seed, files, resume)
-    errors, judged = _assessed(fit, train, judges, seed)
+    fit, errors, judged = _assessed(fit, train, judges, seed)
     _write(fit, errors, task, files)
     found = _told(fit, errors, judged, dropped, files)
     if pair:
@@ -285,20 +285,20 @@ def _telling(what):
 
 
 def _assessed(fit, train, judges, seed):
-    """`Uncertainty` of the fit, and what the held-out logs say with fresh seeds (or None)."""
+    """The fit after a last Newton step, its `Uncertainty`, and what held-out logs say (or None)."""
     from jaxslam.learn import evidence
     from jaxslam.learn_report import Judged
-    from jaxslam.uncertainty import assess
+    from jaxslam.uncertainty import assess, improved
 
-    judged = None
-    if judges:
-        with bar("judging", compiles=True):
-            fresh = seed + 7919
-            judged = Judged(
-                *(evidence(judges, fit.config, p, FRESH, fresh) for p in (fit.start, fit.params))
-            )
     with bar("standard errors", compiles=True):
-        return assess(fit, train, seed=seed + 1), judged
+        errors = assess(fit, train, seed=seed + 1)
+    fit = improved(fit, errors)
+    if not judges:
+        return fit, errors, None
+    with bar("judging", compiles=True):
+        fresh = seed + 7919
+        both = (evidence(judges, fit.config, p, FRESH, fresh) for p in (fit.start, fit.params))
+        return fit, errors, Judged(*both)
 
 
 def _write(fit, errors, task, files):

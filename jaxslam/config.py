@@ -83,6 +83,7 @@ class Config:
             exclusive=False,
             clutter=False,
             forgetting=False,
+            even=False,
         )
         return cls(
             particles=particles,

@@ -1,8 +1,9 @@
 """Maximum-likelihood learning of `Params` from logged runs.
 
-    windows = log.windows(60)                 # pieces of a minute, each with a map of its own
-    fit = learn.fit(windows, config, params, ("err_rot", "sigma_bearing"), held_out=others)
-    errors = uncertainty.assess(fit, windows)
+    parts = jaxslam.windows(log, 60)           # pieces of a minute, each with a map of its own
+    fit = learn.fit(parts, config, params, ("err_rot", "sigma_bearing"), held_out=others)
+    errors = uncertainty.assess(fit, parts)
+    fit = uncertainty.improved(fit, errors)
 
 Adam (Kingma and Ba 2015) climbs the score of `likelihood`, averaged over seeds, on a scale where
 every parameter is free: logarithms of what is positive, log-odds of probabilities. The rate falls
@@ -240,12 +241,13 @@ def fit(
         if progress:
             progress(state.step, steps, record)
     free, stopped = taught.estimate(state)
-    return Fit(names, params, validate(_plain(params, names, free), "the fit"), free,
+    return Fit(names, params, validate(plain(params, names, free), "the fit"), free,
                state.history(), stopped, config, seed, state.step,
                time.perf_counter() - begin)  # fmt: skip
 
 
-def _plain(params, names, free):
+def plain(params, names, free):
+    """`put` with floats, worked out in double precision."""
     with jax.enable_x64(True):
         found = {n: float(from_free(n, float(free[i]))) for i, n in enumerate(names)}
     return params._replace(**found)
@@ -329,7 +331,7 @@ class _Teacher:
         )
         if self.judged is not None and (state.step % told.every == 0 or state.step == told.steps):
             state = self.judge(state)
-        named = _plain(told.params, told.names, free)
+        named = plain(told.params, told.names, free)
         record = {"loss": -value, "gradient_norm": norm,
                   "params": {n: getattr(named, n) for n in told.names}}  # fmt: skip
         return state, record
@@ -367,7 +369,7 @@ class _Teacher:
     def judge(self, state):
         """The state with the tail's mean judged on the held-out logs; `stopped` if that was it."""
         told, free = self.told, self.tail(state)
-        found = evidence(self.judged, told.config, _plain(told.params, told.names, free),
+        found = evidence(self.judged, told.config, plain(told.params, told.names, free),
                          told.held_out_seeds, (told.seed + 1) * 100_003 + state.step)  # fmt: skip
         error = float(np.std(found) / np.sqrt(len(found)))
         judgements = (*state.judgements, (state.step, float(found.mean()), error, free))

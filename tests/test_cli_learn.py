@@ -157,7 +157,8 @@ def test_what_is_lost_or_worse_is_a_warning(logs, call, drives, monkeypatch):
     def assess(fit, logs, seed):
         one = np.ones(1)
         return uncertainty.Uncertainty(
-            fit.names, fit.free, np.eye(1), one, one, one, np.eye(1), np.eye(1), one, "both", 0.1,
+            fit.names, fit.free, np.eye(1), one, one, one, np.eye(1), np.eye(1), one, "both",
+            np.zeros(1), 0.1,
             {0.97: one}, ("resolved",), (),
         )  # fmt: skip
 

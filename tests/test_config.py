@@ -49,7 +49,14 @@ def test_defaults():
         "clutter": True,
         "forgetting": True,
         "proposal": "prior",
+        "even": False,
     }
+
+
+def test_even_is_for_sampled_associations():
+    assert Config(association="sampled", even=True).even
+    with pytest.raises(ValueError, match="even: is for association sampled, not known"):
+        Config(association="known", even=True)
 
 
 def test_the_papers_preset_field_by_field():
@@ -65,6 +72,7 @@ def test_the_papers_preset_field_by_field():
         "clutter": False,
         "forgetting": False,
         "proposal": "prior",
+        "even": False,
     }
     assert Config.paper(particles=10, landmarks=3, measurements=2) == Config(
         sensor="position",

@@ -50,6 +50,7 @@ def make_errors(free_error=(0.1, 0.2, 9.0), **changes):
         curvature=np.diag(1 / free_error**2),
         agreement=np.ones(3),
         made="both",
+        step=np.zeros(3),
         log_z_sd=0.5,
         discounts={0.9: np.array([0.0, 10.0, 0.0]), 0.97: np.zeros(3), 1.0: np.zeros(3)},
         verdict=("resolved", "resolved", "not resolved"),

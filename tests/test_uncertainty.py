@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from jaxslam import uncertainty
+from jaxslam import learn, uncertainty
+from jaxslam.config import Config, default_params
 
 INFORMATION = np.array([[40.0, 10.0], [10.0, 20.0]])
 
@@ -85,3 +86,21 @@ def test_what_nothing_is_known_of_stays_finite():
     assert covariance[0, 0] == pytest.approx(0.04, rel=0.01)
     widths = uncertainty.half_widths(np.diag([25.0, 0.0]))
     np.testing.assert_allclose(widths, [0.1, 0.25], rtol=0.01)
+
+
+def test_the_step_after_a_fit_is_taken_on_the_free_scale():
+    params = default_params()._replace(err_rot=0.1, mount_yaw=0.0)
+    names, none = ("err_rot", "mount_yaw"), np.empty(0)
+    free = learn.taken(params, names)
+    fit = learn.Fit(
+        names, params, params, free, learn.History(*[none] * 8), "done", Config(), 0, 1, 0.0
+    )
+    one = np.ones(2)
+    errors = uncertainty.Uncertainty(
+        names, free, np.eye(2), one, one, one, np.eye(2), np.eye(2), one, "both",
+        np.array([np.log(2), 0.5]), 0.1, {}, ("weak", "weak"), (),
+    )  # fmt: skip
+    found = uncertainty.improved(fit, errors).params
+    assert found.err_rot == pytest.approx(0.2)
+    assert found.mount_yaw == pytest.approx(0.5 * learn.SCALE["mount_yaw"])
+    assert found.err_drift == params.err_drift
