@@ -33,7 +33,8 @@ def make_fit(steps=STEPS, held_out=True, **history):
         tail=np.array([free[9], ends[1]])[: len(judged)],
     )
     told = told._replace(**history)
-    return Fit(NAMES, start, params, ends[1], told, "all steps done", Config(), 0, steps, 12.3)
+    return Fit(NAMES, start, params, ends[1], told, "all steps done", Config(association="sampled"),
+               0, steps, 12.3)  # fmt: skip
 
 
 def make_errors(free_error=(0.1, 0.2, 9.0), **changes):
