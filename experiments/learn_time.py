@@ -26,8 +26,7 @@ TRUTH = dict(err_tran=0.05, err_drift=0.05, sigma_range=0.1, sigma_bearing=0.03,
 NAMES = tuple(TRUTH)
 OFF = np.array([1.0, -1.0, 1.0, -1.0, 0.2])  # free scale
 SIMPLEX = np.array([0.5, 0.5, 0.5, 0.5, 0.1])  # a cautious user's first steps, same scale
-FRAMES, PART, JUDGES, NEAR = 1000, 100, 8, 2.0  # NEAR: nats
-STEPS, RATE, MOST = 60, 0.15, 300
+FRAMES, PART, JUDGES, NEAR, STEPS, RATE, MOST = 1000, 100, 8, 2.0, 60, 0.15, 300  # NEAR: nats
 CONFIG = Config(
     association="known", proposal="informed", particles=200, landmarks=20, measurements=8,
     clutter=False,
@@ -136,6 +135,7 @@ def row(name, kind, points, held_out, target):
     near = f"{there.seconds:.0f} | {there.evaluations}" if there else "not reached |"
     print(name, dict(zip(NAMES, np.round(np.exp(last.free), 4), strict=True)), flush=True)
     cells = f"{last.evaluations} {kind} | {last.seconds:.0f} | {mean:.1f} ± {error:.1f} | {near} |"
+    print(f"| {name} | {cells}", flush=True)
     return f"| {name} | {cells}", mean
 
 
@@ -154,16 +154,14 @@ def main():
     each = baseline_seconds(log, truth)
     print(of_value, of_score, each, *lines, sep="\n", flush=True)
     line, target = row("learn.fit", "scores", fitted(log, start, 1), held_out, None)
-    print(line, flush=True)
     points = searched(value, true + OFF)
     lines += [line, row("Nelder-Mead, our likelihood", "values", points, held_out, target)[0]]
-    print(lines[-1], flush=True)
     count = points[-1].evaluations
-    lines.append(f"| Nelder-Mead, NumPy baseline (estimate) | {count} values | {count * each:.0f} "
-                 "| not run | | |")  # fmt: skip
+    cells = f"{count} values | {count * each:.0f} | not run | | |"
+    lines.append(f"| Nelder-Mead, NumPy baseline (estimate) | {cells}")
     wall, busy = time.perf_counter() - began[0], time.process_time() - began[1]
     told = TOLD.format(FRAMES, of_value, of_score, busy, wall, JUDGES, NEAR, each, PART)
-    print(told)
+    print(told, "", *lines, sep="\n")
     RESULT.write_text("\n".join([told, "", *lines]) + "\n")
 
 
