@@ -35,6 +35,9 @@ TRANSFORM = {name: "linear" if name in SCALE else "log" for name in Params._fiel
 TRANSFORM["outlier"] = "logit"
 TAIL = 0.3  # share of the steps whose mean is the estimate
 LAST_RATE = 0.05  # of the first
+# Adam's memory. Noise set too small gives scores a hundred times larger than any later one, after
+# which a long second moment would keep all steps small.
+MOMENTS = 0.9, 0.9
 
 
 class History(NamedTuple):
@@ -295,7 +298,7 @@ class _Teacher:
         self.told, self.data, self.judged = told, data, judged
         self.frames = float(data.measurements.active.sum()) / len(data.start_pose) * told.batch
         schedule = optax.cosine_decay_schedule(told.rate, told.steps, LAST_RATE)
-        self.rate, self.adam = schedule, optax.adam(schedule, b1=0.9, b2=0.99)
+        self.rate, self.adam = schedule, optax.adam(schedule, *MOMENTS)
         dtype = data.start_pose.dtype
         self.numbers = Params(*(jnp.asarray(v, dtype) for v in told.params))
         edges = [told.bounds.get(n, (None, None)) for n in told.names]

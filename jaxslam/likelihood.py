@@ -212,13 +212,16 @@ def frame_terms(measurements, params):
 
 class _Carry(NamedTuple):
     """State; derivatives by the parameters (first axis) of every particle's pose (None: held
-    still), its landmarks and its log weight, as inherited; and the sum of the steps' scores."""
+    still), its landmarks and its log weight, as inherited; sums of the steps' scores and of what
+    all particles share of them; least effective sample size."""
 
     state: fastslam.State
     pose: jax.Array | None
     world: dict
     inherited: jax.Array
     total: jax.Array
+    shared: jax.Array
+    ess: jax.Array
 
 
 @partial(jax.jit, static_argnames=("config", "names", "estimator"))
@@ -236,19 +239,20 @@ def scored(params, data, key, config, names, estimator="fisher", discount=DISCOU
          for name in _parts(through, config, frozen)},
         jnp.zeros((len(names), config.particles), zero.dtype),
         jnp.zeros(len(names), zero.dtype),
+        jnp.zeros(len(names), zero.dtype),
+        jnp.asarray(config.particles, zero.dtype),
     )  # fmt: skip
 
     def step(carry, frame):
         return _step(carry, frame, params, key, config, names, through, estimator, discount)
 
-    last, (steps, log_evidence, ess, extra) = jax.lax.scan(
-        step, carry, (data.odometry, data.measurements)
-    )
+    looks = data.odometry, data.measurements
+    last, (steps, log_evidence) = jax.lax.scan(step, carry, looks)
     weight = jnp.exp(last.state.log_weight)
-    at_end = last.inherited @ weight + extra.sum(0)
+    at_end = last.inherited @ weight + last.shared
     whole = discount == 1 if frozen else estimator == "pathwise"
     total = jnp.where(whole, at_end, last.total)
-    return Score(total, log_evidence.sum(), steps, log_evidence, ess.min())
+    return Score(total, log_evidence.sum(), steps, log_evidence, last.ess)
 
 
 def _through(names, config, measurements, frozen):
@@ -298,8 +302,8 @@ def _step(carry, frame, params, key, config, names, through, estimator, discount
         (pose_dot, world_dot, own_after), info.ancestors, info.resampled
     )
     log_evidence = info.log_evidence + frame_terms(measurements, params)
-    carry = _Carry(after, pose_dot, world_dot, own_after, carry.total + gradient)
-    return carry, (gradient, log_evidence, info.ess, extra)
+    sums = carry.total + gradient, carry.shared + extra, jnp.minimum(carry.ess, info.ess)
+    return _Carry(after, pose_dot, world_dot, own_after, *sums), (gradient, log_evidence)
 
 
 def _look(carry, chance, frame, params, config, through, frozen):
@@ -362,7 +366,7 @@ def alternatives_score(match, params):
 
 def _frame_score(measurements, params, names):
     """Derivatives [P] of `frame_terms`."""
-    values = jnp.stack([jnp.asarray(getattr(params, name)) for name in names])
+    values = jnp.array([getattr(params, name) for name in names])
 
     def term(values):
         given = params._replace(**{name: values[i] for i, name in enumerate(names)})

@@ -168,12 +168,7 @@ def test_grad_is_the_score_of_what_is_learnable(x64, scored):
         assert slope != 0 or name not in names or name == "growth"  # which is 0 here
 
 
-NOTHING = pytest.mark.xfail(strict=True, raises=ValueError, reason="nothing to learn: no array")
-
-
-@pytest.mark.parametrize(
-    "name", ["err_rot", "sigma_bearing", pytest.param("caution", marks=NOTHING)]
-)
+@pytest.mark.parametrize("name", ["err_rot", "sigma_bearing", "caution"])
 def test_grad_by_one_parameter(x64, scored, name):
     log, params, config, names, found = scored
 
@@ -217,7 +212,6 @@ def test_frames_of_nothing_at_the_end_change_nothing(x64, scored):
 
 
 def test_temporary_memory_does_not_grow_with_the_log():
-    """But for a number or two of a step, of which the result has the sum or the least."""
     log, params, config = small()
     data, used = likelihood.data_of(log, config), []
 
@@ -231,7 +225,7 @@ def test_temporary_memory_does_not_grow_with_the_log():
         lowered = forward.lower(numbers(params), long, KEY, config, ("err_tran", "sigma_range"))
         used.append(lowered.compile().memory_analysis().temp_size_in_bytes)
     assert used[0] > 0
-    assert used[1] - used[0] < 4500 * 4 * 2 < 4500 * 4 * config.particles
+    assert used[1] == used[0]
 
 
 def test_the_motions_score_is_the_slope_of_its_density(x64):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+import jaxslam
 from jaxslam import cli
 
 README = Path(__file__).resolve().parents[1] / "README.md"
@@ -17,10 +18,23 @@ def blocks(language):
 
 def test_the_python_on_one_screen_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    (code,) = blocks("python")
+    code = blocks("python")[0]
     exec(compile(code, "README.md", "exec"), {})
     assert float(capsys.readouterr().out.split()[-1]) < 1.0
     assert (tmp_path / "runs/python/map.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_the_python_that_learns_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    second = blocks("python")[1]
+    params = jaxslam.default_params("range_bearing", jaxslam.load_log("lost-in-the-woods"))
+    names = {"jaxslam": jaxslam, "params": params}
+    exec(compile(second, "README.md", "exec"), names)
+    found = jaxslam.load_params("learnt.toml", params)
+    assert found.sigma_range < params.sigma_range
+    # Odometry turns too far: truth says 0.95.
+    assert found.gain_rot == pytest.approx(0.95, abs=0.03)
 
 
 @pytest.mark.slow
@@ -34,14 +48,15 @@ def test_the_commands_run(tmp_path, monkeypatch, capsys):
     for command in commands:
         assert cli.main(command) == 0, command
     said = capsys.readouterr().err.splitlines()
-    assert [line for line in said if not line.startswith("note: ")] == []
+    progress = "note: ", "learning: ", "step "
+    assert [line for line in said if not line.startswith(progress)] == []
 
 
 def test_every_command_in_the_readme_exists_and_every_command_is_in_it(capsys):
     text = README.read_text(encoding="utf-8")
     named = set(re.findall(r"jaxslam ([a-z]+)\b", text)) - {"import"}
     known = {"demo", "run", "compare", "convert", "check", "evaluate", "plot", "simulate"}
-    known |= {"calibrate", "extract", "triangulate"}
+    known |= {"calibrate", "extract", "triangulate", "learn"}
     assert known <= named
     for name in named:
         assert cli.main([name, "--help"]) in (0, None)
