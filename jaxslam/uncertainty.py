@@ -159,13 +159,13 @@ def half_widths(outer):
 
 
 def newton(information, score):
-    """A Newton step [P] towards the score's root, of a standard error in each parameter at most.
+    """A Newton step [P] towards the score's root, of two standard errors in each parameter at most.
 
     Adam ends within about one standard error; this takes most of it away.
     """
     inverse = inverted(information)
     error = np.sqrt(np.diag(inverse))
-    return np.clip(inverse @ score, -error, error)
+    return np.clip(inverse @ score, -2 * error, 2 * error)
 
 
 def combined(outer, curvature, noise):
