@@ -84,7 +84,9 @@ def assess(fit, logs, seeds=8, seed=1, discounts=(0.9, likelihood.DISCOUNT, 1.0)
     slope = np.array([_slope(n, f) for n, f in zip(names, fit.free, strict=True)])
     told = {d: (found if d == likelihood.DISCOUNT else look(fit.free, d)).total.sum(0).mean(0)
             for d in discounts}  # fmt: skip
-    verdict, sentences = judged(names, covariance, agreement)
+    # Where the slope is lost in noise, that the two differ tells nothing.
+    differ = agreement if made == "sandwich" else np.ones(len(names))
+    verdict, sentences = judged(names, covariance, differ)
     return Uncertainty(
         names=names,
         free=fit.free,
