@@ -178,7 +178,9 @@ def _config(parts, sensor, association, particles, landmarks):
     from jaxslam.frames import frames
     from jaxslam.runner import config_for
 
-    told = {"particles": particles} | ({"landmarks": landmarks} if landmarks else {})
+    # Else doubles of landmarks would pay, and noise be learnt too small.
+    told = {"particles": particles, "even": association == "sampled"}
+    told |= {"landmarks": landmarks} if landmarks else {}
     made = [config_for(part, sensor, association, proposal="informed", **told) for part in parts]
     config = dataclasses.replace(
         made[0],

@@ -55,7 +55,6 @@ def config_for(log, sensor=None, association="maximum_likelihood", **settings):
     settings.setdefault("measurements", max(1, int(np.bincount(log.frame, minlength=1).max())))
     if association == "known" and log.identity is not None:
         settings.setdefault("landmarks", max(1, len(np.unique(log.identity[log.identity >= 0]))))
-    settings.setdefault("even", association == "sampled")
     return Config(sensor=sensor, association=association, **settings)
 
 
