@@ -83,7 +83,7 @@ def moved(errors, discount):
     """Which parameter the score with another discount would move most, and by how many standard
     errors: a Newton step from where the two scores differ."""
     change = errors.discounts[discount] - errors.discounts[DISCOUNT]
-    step = np.linalg.pinv(errors.curvature) @ change
+    step = errors.covariance @ change
     far = np.abs(step) / np.maximum(errors.free_error, 1e-300)
     return errors.names[int(np.argmax(far))], float(far.max())
 
@@ -163,7 +163,7 @@ def draw_learning(fit, errors):
             _draw_parameter(axes[i], fit, errors, i, name)
         _draw_likelihood(axes[len(names)], fit)
         if len(fit.history.held_out):
-            _draw_held_out(axes[len(names) + 1], fit)
+            _draw_held_out(axes[len(names) + 1], fit, errors)
         for spare in axes[panels:]:
             spare.remove()
         for shown in axes[:panels]:
@@ -219,13 +219,14 @@ def _draw_likelihood(axes, fit):
     axes.set_title("log likelihood, nats per frame")
 
 
-def _draw_held_out(axes, fit):
+def _draw_held_out(axes, fit, errors):
     told = fit.history
     axes.errorbar(
         told.held_out_step, told.held_out, told.held_out_error,
         fmt="o-", color=REFINED, ms=4, lw=1.2, capsize=2,
     )  # fmt: skip
-    chosen = np.flatnonzero((np.asarray(told.tail) == fit.free).all(1))
+    # The one that the last Newton step went from.
+    chosen = np.flatnonzero((np.asarray(told.tail) == errors.free).all(1))
     if len(chosen):
         step, value = told.held_out_step[chosen[0]], told.held_out[chosen[0]]
         axes.plot(step, value, "o", ms=10, mfc="none", mec=LANDMARK, mew=1.5)

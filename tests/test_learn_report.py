@@ -200,3 +200,9 @@ def test_a_surface_without_an_ellipse_where_the_error_is_not_known():
     found = surface.Surface(("err_rot", "mount_yaw"), first, last, below, 0.7)
     figure = surface.draw_surface(found, fit, errors)
     assert len(figure.axes[0].lines) == 3
+
+
+def test_the_judgement_that_was_taken_is_marked_though_a_newton_step_followed():
+    fit = make_fit()
+    figure = learn_report.draw_learning(fit._replace(free=fit.free + 0.01), make_errors())
+    assert [text.get_text() for text in figure.axes[4].texts] == ["taken"]
