@@ -20,6 +20,7 @@ from jaxslam.console import (
     LogName,
     Overwrite,
     Seed,
+    Sensor,
     Start,
     bar,
     check_new,
@@ -57,8 +58,6 @@ MovedLog = option(str, "where the run's log is, if it was moved") | None
 Folder = option(Path, "a run's folder")
 ParamFile = option(Path, "TOML file of parameters, for those it names") | None
 Paper = option(bool, "the paper's rules: positions, each its best match, no clutter")
-Sensors = Literal["range_bearing", "position", "bearing"]
-Sensor = option(Sensors, "what is used (the first that the log has)") | None
 Worlds = Literal["room", "grid", "field"]
 ASSOCIATED = "find out which landmark was measured, believe the log, or draw by particle"
 Association = option(Literal[ASSOCIATIONS], ASSOCIATED)

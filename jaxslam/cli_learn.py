@@ -17,6 +17,7 @@ from jaxslam.console import (
     LogName,
     Overwrite,
     Seed,
+    Sensor,
     Start,
     bar,
     check_new,
@@ -26,8 +27,6 @@ from jaxslam.console import (
     whole,
 )
 
-Sensors = Literal["range_bearing", "position", "bearing"]
-Sensor = option(Sensors, "what is used (the first that the log has)") | None
 HeldOut = Annotated[
     list[str],
     Parameter(help="logs to judge by, not to learn from", consume_multiple=True, negative=()),

@@ -3,7 +3,7 @@
 import sys
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -23,6 +23,8 @@ def whole(text, least=1, most=10**9):
 Seed = whole("of the random draws: the same seed, the same run", 0, 2**32 - 1)
 LogName = option(str, f"a .npz file, or {DEMO}")
 Overwrite = option(bool, "replace what is there")
+Sensors = Literal["range_bearing", "position", "bearing"]
+Sensor = option(Sensors, "what is used (the first that the log has)") | None
 Start = option(float, "use the log from here on [s after its start]")
 End = option(float, "use the log up to here [s after its start] (all)") | None
 OutLog = option(Path, "the log to write, a .npz file")

@@ -237,7 +237,7 @@ def fit(
     print_of = _fingerprint(told, (data, judged))
     if resume:
         state = _load(checkpoint, print_of, state)
-    while state.step < steps and not (state.stopped and judged is not None):
+    while state.step < steps and not state.stopped:
         state, record = taught.advance(state)
         if checkpoint is not None and (state.step % every == 0 or state.step == steps):
             _save(checkpoint, print_of, state)
