@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxslam import learn, likelihood, simulate, uncertainty
+from jaxslam import learn, likelihood, scale, simulate, uncertainty
 from jaxslam.atomic import replacing
 from jaxslam.config import Config, Params, default_params
 
@@ -40,7 +40,8 @@ CASES = {
     "bearing": ("bearing", "known", ("err_tran", "err_drift", "sigma_bearing", "gain_rot")),
     "hidden": ("range_bearing", "sampled", tuple(NOISE)),
 }
-STEPS, RATE, SEEDS = 45, 0.2, 3
+STEPS, RATE, SEEDS = 60, 0.2, 3
+NEWTON = 4  # steps after Adam's
 
 
 def world(case, number):
@@ -49,7 +50,8 @@ def world(case, number):
     truth = {n: NOISE[n][0] * float(np.exp(NOISE[n][1] * rng.standard_normal())) for n in NOISE}
     log = simulate.planar(
         "field", 1000 + number, landmarks=20, length_m=30, rate_hz=2.5, odometry_hz=12.5,
-        max_per_frame=8, closed_loop=False, outlier=0.01 if case == "hidden" else 0.0,
+        max_per_frame=8, closed_loop=False, clearance=0.5,
+        outlier=0.01 if case == "hidden" else 0.0,
         view=(-np.pi, np.pi, 5.0 if case == "hidden" else 8.0), **truth,
     )  # fmt: skip
     return log, np.array([truth[n] for n in names]), rng.choice([-1, 1], len(names))
@@ -70,10 +72,10 @@ def problem(case, count):
     params = default_params(sensor, logs[0])._replace(density_new=1e-3, outlier=outlier)
     with jax.enable_x64(True):
         true = np.array(
-            [[float(learn.to_free(n, v)) for n, v in zip(names, t, strict=True)]
+            [[float(scale.to_free(n, v)) for n, v in zip(names, t, strict=True)]
              for _, t, _ in worlds]
         )  # fmt: skip
-    off = np.where([name.startswith("gain") for name in names], 0.2, 1.0)
+    off = np.where([name.startswith("gain") for name in names], 0.2 / scale.SCALE["gain_rot"], 1.0)
     return (
         learn.stacked(logs, config, params),
         config,
@@ -132,11 +134,12 @@ def climbed(scores, start, saved):
 
 
 def assessed(scores, free):
-    """Free values after two Newton steps, their errors [L, P] (statistical and Monte Carlo), how
+    """Free values after Newton's steps, their errors [L, P] (statistical and Monte Carlo), how
     they were made, scores, and standard errors by other ways."""
-    found = scores(free, SEEDS, 1)
-    free = free + stepped(outers_of(found), found)
-    found = scores(free, 2 * SEEDS, 2)
+    for step in range(NEWTON - 1):
+        found = scores(free, SEEDS, 1 + step)
+        free = free + stepped(outers_of(found), found)
+    found = scores(free, 2 * SEEDS, NEWTON)
     outers = outers_of(found)
     curves = slopes(scores, free, outers)
     slope = np.array([one[0] for one in curves])

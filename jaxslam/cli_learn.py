@@ -196,7 +196,7 @@ def _config(parts, sensor, association, particles, landmarks):
 
 def _task(train, config, path, parameters):
     """`paramfile.Learning`: where to start, what to learn, in which bounds, with which priors."""
-    from jaxslam import learn, likelihood
+    from jaxslam import learn, likelihood, scale
     from jaxslam.config import default_params
     from jaxslam.paramfile import Learning, load_learning
 
@@ -211,7 +211,7 @@ def _task(train, config, path, parameters):
         names = tuple(name.strip() for name in parameters.split(","))
     if names is None:  # what starts at 0 has no logarithm; who wants it learnt names it
         names = learn.default_names(config)
-        names = tuple(n for n in names if getattr(start, n) > 0 or n in learn.SCALE)
+        names = tuple(n for n in names if getattr(start, n) > 0 or n in scale.LINEAR)
     if len(set(names)) < len(names):
         raise ValueError(f"--parameters: {', '.join(names)}; name each once")
     with _bias_told_later():
@@ -220,7 +220,7 @@ def _task(train, config, path, parameters):
         note(f"caution, {start.caution:g} rad, becomes a part of sigma_bearing: it is learnt")
         both = (start.sigma_bearing**2 + start.caution**2) ** 0.5
         start = start._replace(sigma_bearing=both, caution=0.0)
-    learn.taken(start, names)  # refuses a start at 0
+    scale.taken(start, names)  # refuses a start at 0
     mine = [
         {name: pair for name, pair in pairs.items() if name in names}
         for pairs in (told.bounds, told.priors)

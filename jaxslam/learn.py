@@ -5,10 +5,10 @@
     errors = uncertainty.assess(fit, parts)
     fit = uncertainty.improved(fit, errors)
 
-Adam (Kingma and Ba 2015) climbs the score of `likelihood`, averaged over seeds, on a scale where
-every parameter is free: logarithms of what is positive, log-odds of probabilities. The rate falls
-and the estimate is the mean of the last iterates. Held-out logs, filtered with fresh seeds, say
-when to stop: the likelihood of what was learnt from goes on rising after theirs began to fall.
+Adam (Kingma and Ba 2015) climbs the score of `likelihood`, averaged over seeds, on the free scale
+of `scale`. The rate falls and the estimate is the mean of the last iterates. Held-out logs,
+filtered with fresh seeds, say when to stop: the likelihood of what was learnt from goes on rising
+after theirs began to fall.
 """
 
 import hashlib
@@ -28,11 +28,8 @@ from jaxslam import likelihood
 from jaxslam.atomic import replacing
 from jaxslam.config import Params
 from jaxslam.paramfile import validate
+from jaxslam.scale import SCALE, from_free, plain, put, taken, to_free
 
-# What one unit of the free scale is; 1 must be a large change, as it is for a logarithm.
-SCALE = {"bias_drift": 0.1, "mount_x": 0.1, "mount_y": 0.1, "mount_yaw": 0.1}
-TRANSFORM = {name: "linear" if name in SCALE else "log" for name in Params._fields}
-TRANSFORM["outlier"] = "logit"
 TAIL = 0.3  # share of the steps whose mean is the estimate
 LAST_RATE = 0.05  # of the first
 # Adam's memory. Noise set too small gives scores a hundred times larger than any later one, after
@@ -69,40 +66,6 @@ class Fit(NamedTuple):
     seed: int
     steps: int
     seconds: float
-
-
-def to_free(name, value):
-    """A parameter's value on the free scale."""
-    kind = TRANSFORM[name]
-    if kind == "log":
-        return jnp.log(value)
-    return jnp.log(value) - jnp.log1p(-value) if kind == "logit" else value / SCALE[name]
-
-
-def from_free(name, free):
-    """A parameter's value from the free scale."""
-    kind = TRANSFORM[name]
-    if kind == "log":
-        return jnp.exp(free)
-    return jax.nn.sigmoid(free) if kind == "logit" else free * SCALE[name]
-
-
-def put(params, names, free):
-    """`params` with the values that `free` [P] stands for."""
-    return params._replace(**{n: from_free(n, free[i]) for i, n in enumerate(names)})
-
-
-def taken(params, names):
-    """The free values [P] (float64) of the parameters `names`.
-
-    Raises `ValueError` for a value that has none, such as a noise of zero.
-    """
-    for name in names:
-        value = float(getattr(params, name))
-        if TRANSFORM[name] != "linear" and value <= 0:
-            raise ValueError(f"{name} is {value:g}: to be learnt it must start above 0")
-    with jax.enable_x64(True):
-        return np.array([float(to_free(n, float(getattr(params, n)))) for n in names])
 
 
 def default_names(config):
@@ -217,11 +180,12 @@ def fit(
 
     Logs are independent runs, or windows of one; `batch` of them (None: all) and `seeds` seeds of
     each make a step. `bounds`: (low, high) by name, in its own unit. `priors`: (value, standard
-    deviation on the free scale) by name. Every `every` steps the last iterates' mean is judged
-    on the `held_out` logs with fresh seeds; `patience` times without improvement end the fit, and
-    the last estimate that was not clearly worse than the best is taken. `checkpoint`: file (.npz)
-    written then; `resume`: go on from it, to the same result. `progress`: called with (steps done,
-    steps, dict of loss, gradient_norm, params). Raises `ValueError` for what can't be.
+    deviation) by name, normal on the free scale: the deviation is of the logarithm, the log-odds
+    (`outlier`) or the value itself (`scale.LINEAR`). Every `every` steps the last iterates' mean is
+    judged on the `held_out` logs with fresh seeds; `patience` times without improvement end the
+    fit, and the last estimate that was not clearly worse than the best is taken. `checkpoint`:
+    file (.npz) written then; `resume`: go on from it, to the same result. `progress`: called with
+    (steps done, steps, dict of loss, gradient_norm, params). Raises `ValueError` for what can't be.
     """
     begin = time.perf_counter()
     names = default_names(config) if names is None else tuple(names)
@@ -247,13 +211,6 @@ def fit(
     return Fit(names, params, validate(plain(params, names, free), "the fit"), free,
                state.history(), stopped, config, seed, state.step,
                time.perf_counter() - begin)  # fmt: skip
-
-
-def plain(params, names, free):
-    """`put` with floats, worked out in double precision."""
-    with jax.enable_x64(True):
-        found = {n: float(from_free(n, float(free[i]))) for i, n in enumerate(names)}
-    return params._replace(**found)
 
 
 def _check(told, logs):
@@ -361,6 +318,7 @@ class _Teacher:
         gradient = np.zeros(len(free))
         for name, (centre, spread) in told.priors.items():
             i = told.names.index(name)
+            spread = spread / SCALE.get(name, 1.0)
             gradient[i] = share * (float(to_free(name, centre)) - free[i]) / spread**2
         return gradient
 

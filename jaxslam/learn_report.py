@@ -11,9 +11,9 @@ from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from jaxslam.atomic import replacing
 from jaxslam.config import UNITS
-from jaxslam.learn import TRANSFORM, from_free
 from jaxslam.likelihood import BIASED, DISCOUNT
 from jaxslam.plot import FILTER, LANDMARK, RECKONING, REFINED, STYLE, write_figure
+from jaxslam.scale import TRANSFORM, from_free
 from jaxslam.uncertainty import MANY
 
 KNOWN = 2.0  # free scale: from here on (a factor of 7) a standard error is without meaning

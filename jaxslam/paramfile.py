@@ -8,7 +8,7 @@ file may hold only some of the names. What is to be learnt, and how, may be told
     [bounds]  # lowest and highest, in the parameter's unit
     err_rot = [0.01, 1.0]
     [prior]  # value in its unit; standard deviation of its logarithm (outlier: of its log-odds;
-    err_rot = [0.1, 0.5]  # mount_x, mount_y, mount_yaw, bias_drift: in `learn.SCALE`)
+    err_rot = [0.1, 0.5]  # mount_x, mount_y, mount_yaw, bias_drift: in its unit)
 """
 
 import math

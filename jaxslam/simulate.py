@@ -29,6 +29,7 @@ def planar(
     seed: int = 0,  # the same arguments and seed give the same log
     *,
     landmarks: int = 40,  # how many point landmarks; their ids are 0, 1, ...
+    clearance: float = 0.0,  # m, field only: none of them is closer to where the robot has been
     length_m: float = 60.0,  # m to drive, round and round a smooth closed loop
     speed: float = 0.5,  # m/s
     rate_hz: float = 5.0,  # frames per second (with commands: one at every stop instead)
@@ -76,6 +77,8 @@ def _draw(given):
     start = rng.multivariate_normal(mean, start_cov, method="eigh", check_valid="raise")
     run = _stop_and_go if given.commands else _roll
     odometry_time, odometry, frame_time, pose = run(rng, loop, given, mean, start)
+    if given.clearance:
+        marks = _cleared(rng, marks, sqrt(area), pose, given.clearance)
     looks = [_look(rng, p, marks, given) for p in pose]
     ranges, bearings, identity = (np.concatenate(column) for column in zip(*looks, strict=True))
     noise = {name: getattr(given, name) for name in NOISE}
@@ -99,6 +102,17 @@ def _draw(given):
         truth=_truth(given, frame_time, pose, marks, identity),
         plan=plan,
     )
+
+
+def _cleared(rng, marks, side, pose, clearance):
+    """Landmarks in a square of this side, those in the way moved elsewhere at random."""
+    path = np.vstack([np.linspace(a, b, 9) for a, b in pairwise(pose[:, :2])] or [pose[:, :2]])
+    for _ in range(1000):
+        near = np.hypot(*(marks[:, None] - path).transpose(2, 0, 1)).min(1) < clearance
+        if not near.any():
+            return marks
+        marks = np.where(near[:, None], rng.uniform(0, side, marks.shape), marks)
+    raise ValueError(f"planar: clearance is {clearance:g}: the path leaves no room for that")
 
 
 def _truth(given, frame_time, pose, marks, identity):
@@ -283,6 +297,10 @@ def _check(given):
     rules = {
         "world": (given.world in WORLDS, f"one of {', '.join(WORLDS)}"),
         "landmarks": (given.landmarks >= 1, "1 or more"),
+        "clearance": (
+            0 <= given.clearance < inf and (given.world == "field" or not given.clearance),
+            "0 or more, other than 0 in a field only",
+        ),
         "max_per_frame": (limit is None or limit >= 1, "1 or more, or None"),
         "detection": (0 < given.detection <= 1, "in (0, 1]"),
         "outlier": (0 <= given.outlier < 1, "in [0, 1)"),

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from jaxslam import learn, likelihood
+from jaxslam import learn, likelihood, scale
 from jaxslam.config import UNITS, Params
 from jaxslam.learn_report import KNOWN, fit_axis, values_of
 from jaxslam.plot import LANDMARK, RECKONING, STYLE, ellipses
@@ -78,7 +78,7 @@ def _values(free, params, data, which, keys, config, names):
     def one(item):
         at, log, key = item
         mine = jax.tree.map(lambda leaf: leaf[log], data)
-        return likelihood.value(learn.put(params, names, at), mine, key, config)
+        return likelihood.value(scale.put(params, names, at), mine, key, config)
 
     return learn.spread(one, (free, which, keys))
 

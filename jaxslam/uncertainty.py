@@ -5,7 +5,7 @@ the sum over steps of outer products of the score, each of two different seeds, 
 particles' own noise does not count as information; and minus the slope of the mean score, by finite
 differences with the same seeds on both sides. Where they agree, the covariance of the estimate is
 the inverse of their mean. Where they differ by more than noise, the model is wrong, and it is their
-sandwich (Huber 1967, White 1982). All of it on the free scale of `learn`.
+sandwich (Huber 1967, White 1982). All of it on the free scale of `scale`.
 """
 
 from typing import NamedTuple
@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxslam import learn, likelihood
 from jaxslam.config import Params
+from jaxslam.scale import plain, slope_at
 
 OPEN = 1.0  # free scale: a standard deviation from which on a direction is unresolved
 FAINT = 3.0  # free scale: nobody knows less of a parameter than this standard deviation
@@ -81,7 +82,7 @@ def assess(fit, logs, seeds=8, seed=1, discounts=(0.9, likelihood.DISCOUNT, 1.0)
     inverse = inverted(outer if made == "outer" else (outer + curvature) / 2)
     free_error = np.sqrt(np.diag(covariance))
     spread = np.cov(by_seed.T).reshape(outer.shape) / seeds
-    slope = np.array([_slope(n, f) for n, f in zip(names, fit.free, strict=True)])
+    slope = np.array([slope_at(n, f) for n, f in zip(names, fit.free, strict=True)])
     told = {d: (found if d == likelihood.DISCOUNT else look(fit.free, d)).total.sum(0).mean(0)
             for d in discounts}  # fmt: skip
     # Where the slope is lost in noise, that the two differ tells nothing.
@@ -110,7 +111,7 @@ def improved(fit, errors):
     """The `learn.Fit` after the Newton step that `assess` found: Adam's last iterates still swing
     about the root (experiments/recovery.py: RMS z 1.32 before, 1.09 after)."""
     free = fit.free + errors.step
-    return fit._replace(free=free, params=learn.plain(fit.params, fit.names, free))
+    return fit._replace(free=free, params=plain(fit.params, fit.names, free))
 
 
 class _Look:
@@ -205,12 +206,6 @@ def _positive(matrix):
     """The matrix without its negative eigenvalues, which noise alone makes."""
     values, vectors = np.linalg.eigh(matrix)
     return (vectors * np.maximum(values, 0)) @ vectors.T
-
-
-def _slope(name, free):
-    """Units of a parameter per unit of the free scale."""
-    with jax.enable_x64(True):
-        return float(jax.grad(lambda f: learn.from_free(name, f))(float(free)))
 
 
 def judged(names, covariance, agreement):

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxslam import error_models, learn, simulate
+from jaxslam import error_models, learn, scale, simulate
 from jaxslam.config import Config, default_params
 from jaxslam.error_models import NAMES, Judged, compare, model_of, preferred, table
 from jaxslam.runner import config_for
@@ -43,7 +43,7 @@ def test_what_a_model_learns(model, names, clutter, growth):
 def test_what_is_learnt_as_a_logarithm_starts_above_zero():
     none = default_params()._replace(growth=0.0, outlier=0.0)
     _, params, names = model_of("heavy_tailed+range_dependent", Config(), none)
-    assert np.isfinite(learn.taken(params, names)).all()
+    assert np.isfinite(scale.taken(params, names)).all()
     assert (params.growth, params.outlier) == (0.02, 0.01)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxslam import filter as fastslam
-from jaxslam import learn, likelihood, simulate
+from jaxslam import learn, likelihood, scale, simulate
 from jaxslam.config import Config, Params, default_params
 from jaxslam.odometry import Odometry
 from jaxslam.sensors import Measurements
@@ -43,14 +43,14 @@ def start(logs):
 @pytest.mark.parametrize("name", ["err_rot", "outlier", "mount_yaw", "gain_rot"])
 def test_the_free_scale_there_and_back(x64, name):
     for value in (0.02, 0.3):
-        free = learn.to_free(name, value)
-        assert float(learn.from_free(name, free)) == pytest.approx(value, rel=1e-12)
-    assert float(learn.from_free(name, -40.0)) >= (-4.0 if name == "mount_yaw" else 0.0)
+        free = scale.to_free(name, value)
+        assert float(scale.from_free(name, free)) == pytest.approx(value, rel=1e-12)
+    assert float(scale.from_free(name, -40.0)) >= (-4.0 if name == "mount_yaw" else 0.0)
 
 
 def test_what_starts_at_zero_has_no_logarithm(start):
     with pytest.raises(ValueError, match="growth is 0: to be learnt it must start above 0"):
-        learn.taken(start, ("growth",))
+        scale.taken(start, ("growth",))
 
 
 def test_the_usual_choice_leaves_the_scale_to_the_odometry_when_there_are_bearings_only():
@@ -131,14 +131,14 @@ import jax, sys
 jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
 import numpy as np
 from tests.test_learn import CONFIG, NAMES, drive
-from jaxslam import learn
+from jaxslam import learn, scale
 from jaxslam.config import Params, default_params
 import jax.numpy as jnp
 logs = [drive(1), drive(2), drive(3)]
 params = default_params("range_bearing", logs[0])
 data = learn.stacked(logs, CONFIG, params)
 numbers = Params(*(jnp.float32(v) for v in params))
-found = learn.scores(jnp.asarray(learn.taken(params, NAMES), jnp.float32), numbers, data,
+found = learn.scores(jnp.asarray(scale.taken(params, NAMES), jnp.float32), numbers, data,
                      np.arange(3), jax.random.split(jax.random.key(0), 3), CONFIG, NAMES, 0.97)
 assert len(jax.devices()) == int(sys.argv[1])
 print(*np.asarray(found.total, float).ravel(), *np.asarray(found.log_likelihood, float))

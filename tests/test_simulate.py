@@ -289,3 +289,21 @@ def test_what_is_not_allowed_is_named(name, value):
 def test_a_start_covariance_is_one():
     with pytest.raises(ValueError, match="covariance"):
         planar(length_m=5.0, start_cov=-np.eye(3))
+
+
+def test_clearance_keeps_landmarks_out_of_the_way():
+    told = dict(seed=3, landmarks=30, closed_loop=False)
+    log = planar("field", clearance=0.7, **told)
+    apart = log.truth.landmarks[:, None] - log.truth.pose[:, :2]
+    assert np.hypot(*apart.transpose(2, 0, 1)).min() >= 0.7
+    same = (log.truth.landmarks == planar("field", **told).truth.landmarks).all(1)
+    assert 0 < same.sum() < 30  # the others stay where they were
+
+
+@pytest.mark.parametrize(
+    ("world", "clearance", "message"),
+    [("room", 0.5, "in a field only"), ("field", -1.0, "0 or more"), ("field", 9.0, "no room")],
+)
+def test_clearance_refuses_what_can_not_be(world, clearance, message):
+    with pytest.raises(ValueError, match=message):
+        planar(world, clearance=clearance)

@@ -1,0 +1,65 @@
+"""The scale on which parameters are learnt: there every real number is allowed.
+
+Logarithms of what is positive, log-odds of a probability, in units of which one is a large change:
+a factor e of a noise, a tenth of a gain, 0.1 m or rad of the mounting.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.config import Params
+
+LINEAR = ("bias_drift", "mount_x", "mount_y", "mount_yaw")
+# Steps of a unit are what Adam takes at first: of a gain, no log leaves a factor e open.
+SCALE = {name: 0.1 for name in (*LINEAR, "gain_tran", "gain_rot")}
+TRANSFORM = {name: "linear" if name in LINEAR else "log" for name in Params._fields}
+TRANSFORM["outlier"] = "logit"
+
+
+def to_free(name, value):
+    """A parameter's value on the free scale."""
+    kind = TRANSFORM[name]
+    if kind == "logit":
+        return jnp.log(value) - jnp.log1p(-value)
+    return (jnp.log(value) if kind == "log" else value) / SCALE.get(name, 1.0)
+
+
+def from_free(name, free):
+    """A parameter's value from the free scale."""
+    kind = TRANSFORM[name]
+    if kind == "logit":
+        return jax.nn.sigmoid(free)
+    free = free * SCALE.get(name, 1.0)
+    return jnp.exp(free) if kind == "log" else free
+
+
+def put(params, names, free):
+    """`params` with the values that `free` [P] stands for."""
+    return params._replace(**{n: from_free(n, free[i]) for i, n in enumerate(names)})
+
+
+def plain(params, names, free):
+    """`put` with floats, worked out in double precision."""
+    with jax.enable_x64(True):
+        found = {n: float(from_free(n, float(free[i]))) for i, n in enumerate(names)}
+    return params._replace(**found)
+
+
+def taken(params, names):
+    """The free values [P] (float64) of the parameters `names`.
+
+    Raises `ValueError` for a value that has none, such as a noise of zero.
+    """
+    for name in names:
+        value = float(getattr(params, name))
+        if TRANSFORM[name] != "linear" and value <= 0:
+            raise ValueError(f"{name} is {value:g}: to be learnt it must start above 0")
+    with jax.enable_x64(True):
+        return np.array([float(to_free(n, float(getattr(params, n)))) for n in names])
+
+
+def slope_at(name, free):
+    """Units of a parameter per unit of the free scale."""
+    with jax.enable_x64(True):
+        return float(jax.grad(lambda f: from_free(name, f))(float(free)))
