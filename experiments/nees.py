@@ -201,7 +201,9 @@ def one_refined(given, config, seed):
     )  # fmt: skip
     end = time.perf_counter()
     numbers = jax.tree.map(jnp.asarray, Params(*map(float, params)))
-    table = maps.summarise(state.landmarks, jnp.exp(state.log_weight), best, numbers, config)
+    table = maps.summarise(
+        fastslam.settled(state).landmarks, jnp.exp(state.log_weight), best, numbers, config
+    )
     table = jax.tree.map(np.asarray, table)
     keep = np.flatnonzero(table.kept)
     mean, cov = table.mean[:, keep].T + origin[:2], table.cov[:, keep].T

@@ -11,6 +11,7 @@ from jax.lax import stop_gradient
 
 from jaxslam.geometry import wrap
 from jaxslam.landmarks import score
+from jaxslam.listing import listed
 
 NEW, CLUTTER, PADDING = -1, -2, -3
 
@@ -109,29 +110,38 @@ def _known(config, scorer, measurements, clutter, params, picks=None):
 
 def _maximum_likelihood(config, scorer, measurements, threshold, params):
     """Best slot of each measurement, or -1; exclusive: the best pair first, over the frame."""
-    value, cov = _columns(measurements)
     lanes = scorer.constant.shape[1]
     start = (
         jnp.broadcast_to(threshold[:, None], (len(threshold), lanes)).astype(scorer.constant.dtype),
         jnp.full((len(threshold), lanes), -1, jnp.int32),
     )
+    possible = _possible(config, scorer, measurements, threshold)
+    pairs, count = listed(possible.reshape(-1))
 
     # A running "is it greater" is plain vector code on a CPU; argmax is not (ten times slower).
-    def look(m, best):
-        row = jax.tree.map(lambda leaf: leaf[m], scorer)
-        density = score(config.sensor, row, value, cov, params)
-        better = density > best[0]
-        return jnp.where(better, density, best[0]), jnp.where(better, m, best[1])
+    def look(i, best):
+        k, m = jnp.divmod(pairs[i], possible.shape[1])
+        density = _density(config, scorer, measurements, params, k, m)
+        held = jax.tree.map(lambda leaf: leaf[k], best)
+        better = density > held[0]
+        row = jnp.where(better, density, held[0]), jnp.where(better, m, held[1])
+        return jax.tree.map(lambda leaf, new: leaf.at[k].set(new), best, row)
 
-    rows, count = _candidates(config, scorer, measurements, threshold)
-    best = jax.lax.fori_loop(0, count, lambda i, best: look(rows[i], best), start)
+    best = jax.lax.fori_loop(0, count, look, start)
     if not config.exclusive:
         return best[1]
-    return _settle(config, scorer, measurements, threshold, params, best)
+    return _settle(config, scorer, measurements, threshold, params, best, possible)
 
 
-def _candidates(config, scorer, measurements, threshold):
-    """Slots [M] that some particle of the block might match, first, and how many they are.
+def _density(config, scorer, measurements, params, k, m):
+    """Log densities [n] of measurement k under slot m."""
+    row = jax.tree.map(lambda leaf: leaf[m], scorer)
+    value, cov = tuple(measurements.value[k]), tuple(measurements.cov[k])
+    return score(config.sensor, row, value, cov, params)
+
+
+def _possible(config, scorer, measurements, threshold):
+    """Which slots some particle of the block might match with which measurements [K, M].
 
     A density is at most its normaliser's, less half the square of one component's innovation over
     that component's variance; here with the innovations' smallest and the variances' largest value
@@ -160,49 +170,53 @@ def _candidates(config, scorer, measurements, threshold):
         gap = jnp.maximum(jnp.stack(gaps).min(0), 0)
         # a shade less, for rounding
         away = jnp.maximum(away, gap**2 * (1e-6 * scorer.matrix[2 * i] - 0.999 * factor).min(-1))
-    possible = (~(upper - jnp.maximum(away, 0) <= threshold[:, None])).any(0)
-    return jnp.nonzero(possible, size=slots, fill_value=0)[0].astype(jnp.int32), possible.sum()
+    return ~(upper - jnp.maximum(away, 0) <= threshold[:, None])
 
 
-def _settle(config, scorer, measurements, threshold, params, best):
+def _settle(config, scorer, measurements, threshold, params, best, possible):
     """Resolve measurements that chose the same slot: the loser goes on to its next best slot.
 
     Deferred acceptance (Gale and Shapley 1962). Both sides rank a pair by the same density, so the
     outcome is that of taking the best free pair over and over, whatever the order. Conflicts are
-    rare: each round moves one loser of every particle, and scores only that measurement.
+    rare: each round moves one loser of every particle. Only measurements that share a `possible`
+    slot can be in conflict, and only what is possible is scored.
     """
-    index = jnp.arange(len(threshold))[:, None]
-    value, cov = jnp.asarray(measurements.value).T, jnp.asarray(measurements.cov).T
-    slots = jnp.arange(scorer.constant.shape[0], dtype=jnp.int32)[:, None]
+    total, slots = possible.shape
+    index = jnp.arange(total)[:, None]
+    share = (possible[:, None] & possible).any(-1) & (index < jnp.arange(total))
+    rivals, pairs = listed(share.reshape(-1), total * (total - 1) // 2)
 
     def losers(best):
         density, slot = best
 
-        def beaten(j, lost):
-            stronger = (density[j] > density) | ((density[j] == density) & (j < index))
-            return lost | ((slot == slot[j]) & stronger)
+        def beaten(i, lost):
+            j, k = jnp.divmod(rivals[i], total)
+            same = (slot[j] == slot[k]) & (slot[j] >= 0)
+            second = density[j] >= density[k]
+            lost = lost.at[j].set(lost[j] | (same & ~second))
+            return lost.at[k].set(lost[k] | (same & second))
 
-        lost = jax.lax.fori_loop(0, len(slot), beaten, jnp.zeros(slot.shape, bool))
-        return lost & (slot >= 0)
+        return jax.lax.fori_loop(0, pairs, beaten, jnp.zeros(slot.shape, bool))
 
     def move(carry):
         (density, slot), lost = carry
-        loser = jnp.where(lost, index, len(threshold)).min(0)
-        any_lost = loser < len(threshold)
-        k = jnp.minimum(loser, len(threshold) - 1)
-        here = index == k
+        loser = jnp.where(lost, index, total).min(0)
+        here = index == loser
         held = jnp.where(here, density, 0).sum(0), jnp.where(here, slot, 0).sum(0)
-        table = score(
-            config.sensor, scorer, tuple(v[k] for v in value), tuple(c[k] for c in cov), params
-        )
-        further = (table < held[0]) | ((table == held[0]) & (slots > held[1]))
-        table = jnp.where(further, table, -jnp.inf)
-        top = table.max(0)
-        next_slot = jnp.where(table == top, slots, len(slots)).min(0)
-        found = top > threshold[k]
-        change = here & any_lost
-        density = jnp.where(change, jnp.where(found, top, -jnp.inf), density)
-        slot = jnp.where(change, jnp.where(found, next_slot, -1), slot)
+        moved = here.any(1)
+        tried, count = listed((possible & moved[:, None]).reshape(-1))
+
+        def look(i, found):
+            k, m = jnp.divmod(tried[i], slots)
+            table = _density(config, scorer, measurements, params, k, m)
+            further = (table < held[0]) | ((table == held[0]) & (m > held[1]))
+            better = here[k] & further & (table > threshold[k]) & (table > found[0])
+            return jnp.where(better, table, found[0]), jnp.where(better, m, found[1])
+
+        none = jnp.full_like(density[0], -jnp.inf), jnp.full_like(slot[0], -1)
+        top, next_slot = jax.lax.fori_loop(0, count, look, none)
+        density = jnp.where(here, top, density)
+        slot = jnp.where(here, next_slot, slot)
         return (density, slot), losers((density, slot))
 
     settled = jax.lax.while_loop(lambda carry: carry[1].any(), move, (best, losers(best)))

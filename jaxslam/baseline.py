@@ -43,6 +43,8 @@ class BaselineResult(NamedTuple):
     degenerate: np.ndarray  # [T] no particle had a finite weight
     match: np.ndarray  # [T, N, K] slot, or -1 new, -2 clutter, -3 padding
     slot: np.ndarray  # [T, N, K] slot matched or created, -1 none
+    birth: np.ndarray  # [T, N, K] as match, but the landmark's birth instead of its slot
+    held: np.ndarray  # [T, M] slots that some particle used, before the step's resampling
     births: np.ndarray  # [T, N] landmarks created
     freed: np.ndarray  # [T, N] landmarks forgotten
     overflow: np.ndarray  # [T, N] landmarks lost for want of a slot
@@ -166,11 +168,11 @@ def associate_known(particle, frame, table, clutter):
     return choice
 
 
-def free_slot(particle, measurement, model):
-    """The slot a new landmark gets: its identity's, else the lowest free one; -1 if none is."""
+def free_slot(particle, measurement, free, model):
+    """The slot a new landmark gets: its identity's, else the next of `free`; -1 if none is."""
     if model.association == "known":
         return measurement.identity if measurement.identity < len(particle.landmarks) else -1
-    return next((i for i, landmark in enumerate(particle.landmarks) if landmark is None), -1)
+    return next(free, -1)
 
 
 def forget(particle, before, matched, s, model):
@@ -209,12 +211,14 @@ def dulled(model, o):
     return SimpleNamespace(**vars(model) | louder)
 
 
-def correct(particle, frame, columns, index, model, dull):
+def correct(particle, frame, columns, index, model, dull, held):
     """All measurements of frame number `index`: associate, weigh, update, create, forget.
 
-    Paper, section III-D. Changes the particle in place; returns match [K], slot [K], slots freed.
-    `dull`: the model of what is seen again, from which less is new than in `model`.
+    Paper, section III-D. Changes the particle in place; returns match [K], slot [K], birth [K],
+    slots freed. `dull`: the model of what is seen again, from which less is new than in `model`.
+    `held` [M]: slots that no new landmark may take, since some particle uses them.
     """
+    free = iter(np.flatnonzero(~held).tolist())
     s = ekf.sensor_pose(particle.pose, model)
     before = [i for i, landmark in enumerate(particle.landmarks) if landmark is not None]
     table = score_table(particle, frame, s, model)
@@ -224,15 +228,16 @@ def correct(particle, frame, columns, index, model, dull):
     else:
         choice = associate_likeliest(table, new, clutter, model.exclusive)
 
-    match, used = [PADDING] * columns, [-1] * columns
+    match, used, birth = [PADDING] * columns, [-1] * columns, [PADDING] * columns
     for row, measurement in enumerate(frame):
         k, slot = measurement.k, choice[row]
         match[k] = slot
+        birth[k] = particle.landmarks[slot].birth if slot >= 0 else slot
         if slot == CLUTTER:
             particle.log_weight += clutter[row]
         elif slot == NEW:
             particle.log_weight += new[row]
-            used[k] = free_slot(particle, measurement, model)
+            used[k] = free_slot(particle, measurement, free, model)
             if used[k] >= 0:
                 newborn = ekf.create(measurement, s, index * columns + k, model)
                 particle.landmarks[used[k]] = newborn
@@ -241,7 +246,12 @@ def correct(particle, frame, columns, index, model, dull):
             log_density = ekf.update(particle.landmarks[slot], measurement, s, dull)
             particle.log_weight += np.log(1 - model.outlier) + log_density
     freed = forget(particle, before, choice, s, model) if model.forgetting else 0
-    return match, used, freed
+    return match, used, birth, freed
+
+
+def in_use(particles):
+    """Slots [M] in which some particle holds a landmark."""
+    return np.array([[m is not None for m in p.landmarks] for p in particles]).any(0)
 
 
 def normalise(particles):
@@ -303,21 +313,25 @@ def read_frame(measurements, t, model):
     return frame
 
 
-def step(particles, odometry, frame, columns, index, normals, uniform, model):
+def step(particles, odometry, frame, columns, index, normals, uniform, model, held=None):
     """One step of FastSLAM (paper, eqs. 4 and 5): the new particles, and a row of the result.
 
     `frame` is None when the sensor did not look: then the robot moves, and nothing else happens.
+    `held` [M]: the slots in use (that row's of the step before; None: as the particles have it).
     """
+    held = in_use(particles) if held is None else held
     for particle, n in zip(particles, normals.T, strict=True):
         particle.pose = move(particle.pose, odometry, n, model)
-    outcomes = [([PADDING] * columns, [-1] * columns, 0)] * len(particles)
+    nothing = [PADDING] * columns, [-1] * columns, [PADDING] * columns, 0
+    outcomes = [nothing] * len(particles)
     row = {"log_evidence": 0.0, "nonfinite": 0, "degenerate": False}
     if frame is not None:
         dull = dulled(model, odometry)
-        outcomes = [correct(p, frame, columns, index, model, dull) for p in particles]
+        outcomes = [correct(p, frame, columns, index, model, dull, held) for p in particles]
+        held = in_use(particles)
         row = normalise(particles)
-    match, slot, freed = (np.array(part) for part in zip(*outcomes, strict=True))
-    row |= {"match": match, "slot": slot, "freed": freed}
+    match, slot, birth, freed = (np.array(part) for part in zip(*outcomes, strict=True))
+    row |= {"match": match, "slot": slot, "birth": birth, "freed": freed, "held": held}
     row["births"] = np.sum((match == NEW) & (slot >= 0), axis=1)
     row["overflow"] = np.sum((match == NEW) & (slot < 0), axis=1)
 
@@ -360,7 +374,8 @@ def run(
             u = SimpleNamespace(**{name: float(value[t]) for name, value in drive.items()})
             frame = read_frame(measurements, t, model) if measurements.active[t] else None
             draws = np.asarray(normals[t], float), float(uniforms[t])
-            particles, row = step(particles, u, frame, columns, first_step + t, *draws, model)
+            held = rows[-1]["held"] if rows else None
+            particles, row = step(particles, u, frame, columns, first_step + t, *draws, model, held)
             rows.append(row)
             if progress is not None:
                 progress(t + 1, steps)

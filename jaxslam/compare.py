@@ -195,13 +195,13 @@ def _times(row):
 
 
 class _Trace(NamedTuple):
-    """Every step's poses [T, 3, N], log weights [T, N], ancestors [T, N], matches [T, K, N] and
-    mean pose [T, 3]."""
+    """Every step's poses [T, 3, N], log weights [T, N], ancestors [T, N], births matched [T, K, N]
+    and mean pose [T, 3]."""
 
     pose: np.ndarray
     log_weight: np.ndarray
     ancestors: np.ndarray
-    match: np.ndarray
+    birth: np.ndarray
     mean: np.ndarray
 
 
@@ -209,7 +209,7 @@ class _Trace(NamedTuple):
 def _steps(key, state, odometry, measurements, params, config):
     def body(state, frame):
         state, info = fastslam.step(key, state, *frame, params, config)
-        kept = state.pose, state.log_weight, info.ancestors, info.match, info.estimate.mean
+        kept = state.pose, state.log_weight, info.ancestors, info.birth, info.estimate.mean
         return state, _Trace(*kept)
 
     return jax.lax.scan(body, state, (odometry, measurements))
@@ -226,6 +226,7 @@ def _run_filter(data, config, params, seed, start, log):
     jax.block_until_ready(steps(key, state, *given))  # to warm up
     begin, compiled = time.perf_counter(), compiled - begin
     final, trace = jax.block_until_ready(steps(key, state, *given))
+    final = fastslam.settled(final)
     ran = time.perf_counter() - begin
     numbers = jnp.arange(len(data.time), dtype=jnp.int32)
     chance = jax.vmap(lambda step: fastslam.draws(key, step, config))(numbers)
@@ -253,7 +254,7 @@ def _baseline_map(reference, params, config, identities, origin):
 def _differences(state, trace, reference):
     """`same`, `pose`, `log_weight` and `landmarks` of `Agreement`."""
     equal = (trace.ancestors == reference.ancestors).all(1)
-    equal &= (np.swapaxes(trace.match, 1, 2) == reference.match).all((1, 2))
+    equal &= (np.swapaxes(trace.birth, 1, 2) == reference.birth).all((1, 2))
     total = len(equal)
     same = total if equal.all() else int(np.argmin(equal))
     if same == 0:
@@ -272,15 +273,15 @@ def _map_difference(world, particles):
     cov = np.stack(geometry.covariance(world.factor.astype(float)))
     largest = 0.0
     for i, particle in enumerate(particles):
-        for slot, landmark in enumerate(particle.landmarks):
-            count = 0 if landmark is None else landmark.count
-            if count != world.count[slot, i]:
-                return np.inf
-            if landmark is None:
-                continue
+        marks = sorted((m for m in particle.landmarks if m is not None), key=lambda m: m.birth)
+        slots = np.flatnonzero(world.count[:, i])
+        slots = slots[np.argsort(world.birth[slots, i])]
+        births = [(m.birth, m.count) for m in marks]
+        if births != list(zip(world.birth[slots, i], world.count[slots, i], strict=True)):
+            return np.inf
+        for slot, landmark in zip(slots, marks, strict=True):
             (xx, xy), (_, yy) = landmark.cov
             pairs = [(world.mean, landmark.mean), (cov, (xx, xy, yy))]
-            pairs += [(world.birth[None], landmark.birth)]
             pairs += [(world.anchor, landmark.anchor)] if world.anchor is not None else []
             pairs += (
                 [(world.log_odds[None], landmark.log_odds)] if world.log_odds is not None else []

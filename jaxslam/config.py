@@ -25,7 +25,8 @@ class Config:
     (None: on, unless identities are known). `even`: of n landmarks in view each is as likely
     beforehand to be the one measured, so that a match counts 1 / n; without it a landmark held
     twice would be twice as likely (`sampled` only). `block`: particles worked on at once, so that
-    temporaries stay in cache; it changes the speed, never the result.
+    temporaries stay in cache; `lazy`: landmarks are copied to a particle's descendants when next
+    looked at, with at most `chains` ancestries to keep; of these only `block` makes a difference to the result, that of rounding.
 
     Raises `ValueError` for a value that is not allowed.
     """
@@ -42,6 +43,8 @@ class Config:
     proposal: str = "prior"
     even: bool = False
     block: int = 512
+    lazy: bool = True
+    chains: int = 16
 
     def __post_init__(self):
         for name, allowed in (
@@ -52,7 +55,7 @@ class Config:
             value = getattr(self, name)
             if value not in allowed:
                 raise ValueError(f"Config.{name}: {value!r} is not one of {', '.join(allowed)}")
-        for name in ("particles", "landmarks", "measurements", "block"):
+        for name in ("particles", "landmarks", "measurements", "block", "chains"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"Config.{name}: {value!r} is not a whole number of at least 1")
@@ -61,7 +64,7 @@ class Config:
             raise ValueError(f"Config.resample_threshold: {threshold!r} is not a number >= 0")
         if self.forgetting is None:
             object.__setattr__(self, "forgetting", self.association != "known")
-        for name in ("exclusive", "clutter", "forgetting", "even"):
+        for name in ("exclusive", "clutter", "forgetting", "even", "lazy"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"Config.{name}: {getattr(self, name)!r} is not true or false")
 

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import landmarks, observation, resampling
+from jaxslam import ancestry, births, gate, landmarks, observation, resampling
+from jaxslam.ancestry import Ancestry
 from jaxslam.association import CLUTTER, NEW
 from jaxslam.geometry import wrap
 from jaxslam.landmarks import Landmarks
@@ -21,12 +22,15 @@ from jaxslam.observation import Chance
 
 
 class State(NamedTuple):
-    """What the next step needs: `pose` [3, N] (x, y, heading), the map, log weights [N], `step`."""
+    """What the next step needs: `pose` [3, N] (x, y, heading), the map, log weights [N], `step`;
+    bounds of the slots; and where landmarks are resampled lazily, what `settled` makes good."""
 
     pose: jax.Array
     landmarks: Landmarks
     log_weight: jax.Array
     step: jax.Array
+    bounds: gate.Bounds
+    ancestry: Ancestry | None
 
 
 class Estimate(NamedTuple):
@@ -79,13 +83,23 @@ def init(config, key, pose=(0.0, 0.0, 0.0), cov=None, landmarks_given=None):
     drawn = pose[:, None] + root @ start_draws(key, config).astype(pose.dtype)
     world = landmarks.empty(config, pose.dtype)
     if landmarks_given is not None:
-        world = landmarks.fill(world, landmarks_given)
+        world = births.given(world, landmarks_given)
     return State(
         pose=drawn.at[2].set(wrap(drawn[2])),
         landmarks=world,
         log_weight=jnp.full(n, -jnp.log(n), pose.dtype),
         step=jnp.zeros((), jnp.int32),
+        bounds=gate.of_rows(world),
+        ancestry=ancestry.new(config) if config.lazy and config.resample_threshold else None,
     )
+
+
+def settled(state):
+    """The state with every landmark where its particle is: to read the map, not to go on faster."""
+    if state.ancestry is None:
+        return state
+    world, past = ancestry.update(state.landmarks, state.ancestry, True)
+    return state._replace(landmarks=world, ancestry=past)
 
 
 def square_root(cov):
@@ -120,9 +134,7 @@ def step(key, state, odometry, measurements, params, config):
 
 def advance(chance, state, odometry, measurements, params, config):
     """`step` with its random numbers given: `chance` is that of `draws`."""
-    seen = observation.observe(
-        state.pose, state.landmarks, chance, odometry, measurements, params, config, state.step
-    )
+    seen = observation.observe(state, chance, odometry, measurements, params, config)
     return conclude(chance, state, seen, measurements.active, config)
 
 
@@ -138,9 +150,8 @@ def conclude(chance, state, seen, active, config):
     ess = 1 / jnp.sum(weight**2)
     threshold = config.resample_threshold
     wanted = active & ((ess < threshold * config.particles) | (threshold >= 1))
-    moved = State(pose, seen.landmarks, log_weight, state.step + 1)
+    moved = State(pose, seen.landmarks, log_weight, state.step + 1, seen.bounds, seen.ancestry)
     resampled, ancestors = _resample(moved, wanted, chance.uniform, config)
-    birth = jnp.take_along_axis(seen.landmarks.birth, jnp.maximum(match, 0), 0)
     info = Info(
         pose=pose,
         log_weight=log_weight,
@@ -150,7 +161,7 @@ def conclude(chance, state, seen, active, config):
         resampled=wanted,
         ancestors=ancestors,
         match=match,
-        birth=jnp.where(match >= 0, birth, match),
+        birth=seen.birth,
         log_choice=seen.log_choice,
         new=jnp.sum(match[:, estimate.best] == NEW),
         outliers=jnp.sum(match == CLUTTER),
@@ -208,6 +219,12 @@ def _resample(state, wanted, uniform, config):
         return state, same
 
     ancestors = jnp.where(wanted, resampling.systematic(state.log_weight, uniform), same)
-    pose, world = resampling.gather((state.pose, state.landmarks), ancestors, wanted)
+    pose = resampling.gather(state.pose, ancestors, wanted)
     log_weight = jnp.where(wanted, -jnp.log(n), state.log_weight)
-    return State(pose, world, log_weight, state.step), ancestors
+    world, past = state.landmarks, state.ancestry
+    if past is None:
+        world = resampling.gather(world, ancestors, wanted)
+    else:
+        past = ancestry.resampled(past, ancestors, wanted)
+    state = state._replace(pose=pose, landmarks=world, log_weight=log_weight, ancestry=past)
+    return state, ancestors

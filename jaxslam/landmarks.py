@@ -1,4 +1,4 @@
-"""The map of a particle: score measurements, update, create, forget.
+"""The map of a particle: score measurements, update, forget.
 
 Arrays carry the particles last ([2, M, N] and so on, M slots): rows of many particles are
 contiguous, and every function below works on all of them at once.
@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxslam import geometry, sensors
 from jaxslam.geometry import wrap
+from jaxslam.listing import listed
 
 NODES, BETWEEN = 5, 0.75  # normals a bearing landmark is split into; share of variance between
 _node, _weight = np.polynomial.hermite_e.hermegauss(NODES)
@@ -228,111 +229,121 @@ def settle(world):
     return world._replace(count=jnp.abs(world.count))
 
 
-def fill(world, given):
-    """The map with its first slots set to a given one: mean [2, L], factor [3, L] (, anchor).
-
-    A given landmark is certain to exist until it has been seen.
-    """
-    parts = dict(zip(("mean", "factor", "anchor"), given, strict=False))
-    size = jnp.shape(parts["mean"])[1]
-    if size > world.count.shape[0]:
-        raise ValueError(f"{size} landmarks given, but the map has {world.count.shape[0]} slots")
-    world = world._replace(
-        count=world.count.at[:size].set(1),
-        birth=world.birth.at[:size].set(-jnp.arange(4, 4 + size, dtype=jnp.int32)[:, None]),
-        log_odds=None if world.log_odds is None else world.log_odds.at[:size].set(jnp.inf),
-        **{
-            name: getattr(world, name).at[:, :size].set(jnp.asarray(value)[:, :, None])
-            for name, value in parts.items()
-        },
-    )
-    return world
-
-
-def update_matched(sensor, sensor_pose, world, match, measurements, params):
+def update_matched(sensor, sensor_pose, world, match, measurements, params, again):
     """The map after the frame's matched measurements, in their order, and log densities [n].
 
-    Only the matched slots are read and written: gather, update, scatter. The count of a matched
-    slot comes back negative, as a mark for `existence` (to compare with the old counts instead
-    would keep the old map alive, and XLA would copy all of it for every block); `settle` ends it.
+    Only the matched slots are read and written, all at once; `again`: the measurements of a frame
+    may match a slot more than once, then one after the other. The count of a matched slot comes
+    back negative, as a mark for `existence` (to compare with the old counts instead would keep the
+    old map alive, and XLA would copy all of it for every block); `settle` ends it.
     """
-    lane = jnp.arange(match.shape[1])
     inlier = jnp.log1p(-params.outlier)
+    value, cov = (tuple(part.T[:, :, None]) for part in map(jnp.asarray, measurements[:2]))
+    times = _times(match) if again else jnp.zeros_like(match)
 
-    def one(k, carry):
-        mean, factor, count, density = carry
-        matched = match[k] >= 0
-        slot = jnp.where(matched, match[k], 0)
-        anchor = None if world.anchor is None else tuple(world.anchor[:, slot, lane])
-        new_mean, new_factor, log_density = update(
-            sensor,
-            sensor_pose,
-            tuple(mean[:, slot, lane]),
-            tuple(factor[:, slot, lane]),
-            anchor,
-            tuple(measurements.value[k]),
-            tuple(measurements.cov[k]),
-            params,
+    def some(carry):
+        i, world, density = carry
+        slot = jnp.where(times == i, match, -1)
+        old = _read(world, slot)
+        anchor = None if old.anchor is None else tuple(old.anchor)
+        mean, factor, log_density = update(
+            sensor, sensor_pose, tuple(old.mean), tuple(old.factor), anchor, value, cov, params
         )
-        slot = jnp.where(matched, slot, mean.shape[1])  # out of range: dropped
-        mean = mean.at[:, slot, lane].set(jnp.stack(new_mean), mode="drop", unique_indices=True)
-        factor = factor.at[:, slot, lane].set(
-            jnp.stack(new_factor), mode="drop", unique_indices=True
+        new = jnp.stack(mean), jnp.stack(factor), -1 - jnp.abs(old.count)
+        world = _write(world, slot, new)
+        return i + 1, world, density + jnp.where(slot >= 0, inlier + log_density, 0).sum(0)
+
+    start = 0, world, jnp.zeros_like(sensor_pose[0])
+    if not again:
+        return some(start)[1:]
+    return jax.lax.while_loop(lambda carry: carry[0] <= times.max(), some, start)[1:]
+
+
+def _times(match):
+    """How often the slot of a match [K, n] was matched before in the frame."""
+
+    def one(k, times):
+        more = (match == match[k]) & (match >= 0) & (jnp.arange(len(match))[:, None] > k)
+        return times + more
+
+    return jax.lax.fori_loop(0, len(match), one, jnp.zeros_like(match))
+
+
+def _shared(slot):
+    """Of slots [K, n], -1 for none: the largest [K]; which rows [K] and how many have no other, and
+    the same of those that have."""
+    top = slot.max(1)
+    alike = ((slot == top[:, None]) | (slot < 0)).all(1)
+    return top, listed(alike & (top >= 0)), listed(~alike)
+
+
+def _read(world, slot):
+    """The landmarks [.., K, n] in the slots [K, n] of each particle; -1: any."""
+    parts = world._replace(log_odds=None, birth=None)
+    lane = jnp.arange(slot.shape[1])
+    top, (rows, count), (others, rest) = _shared(slot)
+
+    def put(found, k, row):
+        return jax.tree.map(
+            lambda leaf, new: jax.lax.dynamic_update_index_in_dim(leaf, new, k, leaf.ndim - 2),
+            found,
+            row,
         )
-        seen_again = -1 - jnp.abs(count[jnp.minimum(slot, len(count) - 1), lane])
-        count = count.at[slot, lane].set(seen_again, mode="drop", unique_indices=True)
-        return mean, factor, count, density + jnp.where(matched, inlier + log_density, 0)
 
-    start = (world.mean, world.factor, world.count, jnp.zeros_like(sensor_pose[0]))
-    mean, factor, count, density = jax.lax.fori_loop(0, match.shape[0], one, start)
-    return world._replace(mean=mean, factor=factor, count=count), density
+    def one(i, found):
+        k = rows[i]
+        return put(found, k, jax.tree.map(lambda leaf: leaf[..., top[k], :], parts))
+
+    def other(i, found):
+        k = others[i]
+        at = jnp.maximum(slot[k], 0)
+        return put(found, k, jax.tree.map(lambda leaf: leaf[..., at, lane], parts))
+
+    found = jax.tree.map(lambda leaf: jnp.ones((*leaf.shape[:-2], *slot.shape), leaf.dtype), parts)
+    found = _rounds(count, one, found)
+    return _rounds(rest, other, found)
 
 
-def create(config, sensor_pose, world, match, measurements, params, step_number):
-    """The map with a landmark for every measurement matched as new, and the overflow [n].
+def _write(world, slot, new):
+    """The map with means, factors and counts [.., K, n] put into the slots [K, n]; -1: none.
 
-    With known identities identity i takes slot i, else the lowest free slot, in the measurements'
-    order. Births are rare: each round serves one of every particle that still has any.
+    Most often all particles of a block match the same slot: then it is a row.
     """
-    total, slots = match.shape[0], jnp.arange(world.count.shape[0])[:, None]
-    index, lane = jnp.arange(total)[:, None], jnp.arange(match.shape[1])
-    value, cov = jnp.asarray(measurements.value).T, jnp.asarray(measurements.cov).T
+    lane = jnp.arange(slot.shape[1])
+    top, (rows, count), (others, rest) = _shared(slot)
 
-    def one(carry):
-        world, waiting, overflow = carry
-        k = jnp.where(waiting, index, total).min(0)
-        born = k < total
-        k = jnp.minimum(k, total - 1)
-        if config.association == "known":
-            slot = jnp.where(measurements.identity[k] >= 0, measurements.identity[k], len(slots))
-        else:
-            slot = jnp.where(world.count == 0, slots, len(slots)).min(0)
-        mean, factor, anchor = sensors.locate(
-            config.sensor, sensor_pose, tuple(v[k] for v in value), tuple(c[k] for c in cov), params
-        )
-        fresh = Landmarks(
-            mean=jnp.stack(mean),
-            factor=jnp.stack(factor),
-            anchor=None if world.anchor is None else jnp.stack(anchor),
-            # Marked as matched: `existence` will add what is taken off here.
-            log_odds=None
-            if world.log_odds is None
-            else params.existence_new - params.existence_seen,
-            count=-1,
-            birth=(step_number * total + k).astype(jnp.int32),
-        )
-        target = jnp.where(born, slot, len(slots))  # out of range: dropped
-        world = jax.tree.map(
-            lambda old, new: old.at[..., target, lane].set(new, mode="drop", unique_indices=True),
-            world,
-            fresh,
-        )
-        lost = born & (slot >= len(slots))
-        return world, waiting & (index != k), overflow + lost
+    def one(i, leaves):
+        k = rows[i]
 
-    carry = (world, match == -1, jnp.zeros(match.shape[1], jnp.int32))
-    world, _, overflow = jax.lax.while_loop(lambda carry: carry[1].any(), one, carry)
-    return world, overflow
+        def put(leaf, new):
+            # Of the others: another measurement may have been put there meanwhile.
+            held = jax.lax.dynamic_index_in_dim(leaf, top[k], leaf.ndim - 2, keepdims=False)
+            row = jnp.where(slot[k] >= 0, new[..., k, :], held)
+            return jax.lax.dynamic_update_index_in_dim(leaf, row, top[k], leaf.ndim - 2)
+
+        return jax.tree.map(put, leaves, new)
+
+    def other(i, leaves):
+        k = others[i]
+        to = jnp.where(slot[k] >= 0, slot[k], world.count.shape[0])  # beyond: dropped
+        return jax.tree.map(
+            lambda leaf, new: leaf.at[..., to, lane].set(
+                new[..., k, :], mode="drop", unique_indices=True
+            ),
+            leaves,
+            new,
+        )
+
+    leaves = _rounds(count, one, (world.mean, world.factor, world.count))
+    mean, factor, count = _rounds(rest, other, leaves)
+    return world._replace(mean=mean, factor=factor, count=count)
+
+
+def _rounds(count, body, start):
+    """`jax.lax.fori_loop` from 0 to a count worked out."""
+    return jax.lax.while_loop(
+        lambda carry: carry[0] < count, lambda carry: (carry[0] + 1, body(*carry)), (0, start)
+    )[1]
 
 
 class Table(NamedTuple):
@@ -356,9 +367,15 @@ def summarise(world, weight, best, params, config):
     centre, _, depth_known = to_world(config.sensor, mine)
     confirmed = True if mine.log_odds is None else mine.log_odds >= params.existence_confirm
 
+    slots, lane = jnp.arange(len(mine.birth)), jnp.arange(len(weight))
+
     def one(birth, centre):
-        share = weight * ((world.birth == birth) & (world.count > 0))
-        point, cov, known = to_world(config.sensor, world)
+        # Births of one frame may be in other slots where a particle had more of them.
+        same = (world.birth == birth) & (world.count > 0)
+        at = jnp.where(same, slots[:, None], -1).max(0)
+        row = jax.tree.map(lambda leaf: leaf[..., jnp.maximum(at, 0), lane], world)
+        share = weight * (at >= 0)
+        point, cov, known = to_world(config.sensor, row)
         share = jnp.where(known, share, 0)
         share = share / share.sum()
         dx, dy = point[0] - centre[0], point[1] - centre[1]

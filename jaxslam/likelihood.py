@@ -13,6 +13,7 @@ what it adds to the step at hand is mostly noise (Poyiadjis, Doucet and Singh 20
 that of MOP, Tan, Hooker and Ionides 2024). docs/gradients.md says when to distrust which.
 """
 
+import dataclasses
 import warnings
 from functools import partial
 from typing import NamedTuple
@@ -169,6 +170,7 @@ _differentiable.defjvp(_derivative, symbolic_zeros=True)
 @partial(jax.jit, static_argnames="config")
 def value(params, data, key, config):
     """The estimate of the log likelihood alone."""
+    config = dataclasses.replace(config, lazy=False)
     start, key = jax.random.split(key)
     state = _begin(data, start, config)
 
@@ -228,6 +230,8 @@ class _Carry(NamedTuple):
 def scored(params, data, key, config, names, estimator="fisher", discount=DISCOUNT):
     """`score` of `Data`, unchecked, for use inside other compiled programs."""
     frozen = estimator == "fisher"
+    # Derivatives are resampled along with the landmarks; where these lie makes no difference.
+    config = dataclasses.replace(config, lazy=False)
     start, key = jax.random.split(key)
     state = _begin(data, start, config)
     through = _through(names, config, data.measurements, frozen)
@@ -314,9 +318,8 @@ def _look(carry, chance, frame, params, config, through, frozen):
     def look(values, pose, arrays):
         world = state.landmarks._replace(**arrays)
         given = params._replace(**dict(zip(through, values, strict=True)))
-        seen = observation.observe(
-            pose, world, chance, *frame, given, config, state.step, frozen=frozen
-        )
+        moved = state._replace(pose=pose, landmarks=world)
+        seen = observation.observe(moved, chance, *frame, given, config, frozen=frozen)
         moved = None if frozen else seen.pose
         return (moved, {name: getattr(seen.landmarks, name) for name in parts}, seen.density), seen
 

@@ -3,15 +3,29 @@
 A block's temporaries stay in cache; the arrays of all particles are read and written once.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import gammaln
 
-from jaxslam import association, geometry, landmarks, motion, proposal, sensors
+from jaxslam import (
+    ancestry,
+    association,
+    births,
+    gate,
+    geometry,
+    landmarks,
+    motion,
+    proposal,
+    sensors,
+)
 from jaxslam.association import CLUTTER, NEW
 from jaxslam.landmarks import Landmarks
+
+SWEEP = 16  # steps
+SMALLEST = gate.FEW  # slots of which a block takes copies; four times as many, and so on, or all
 
 
 class Chance(NamedTuple):
@@ -25,27 +39,31 @@ class Chance(NamedTuple):
 
 class Observed(NamedTuple):
     """Particles after a frame: `pose` [3, N] and map; `density` [N], log of motion x measurements
-    over what pose and associations were drawn from; `match` [K, N]; `log_choice` [N], log
-    probability of its draw; `counts` [2, N]: landmarks lost for want of a slot, and forgotten;
-    `u` [3, N]: the normals that `motion.sample` made the poses of."""
+    over what pose and associations were drawn from; `match` and `birth` [K, N] (`filter.Info`);
+    `log_choice` [N], log probability of the draw; `counts` [2, N]: landmarks lost for want of a
+    slot, and forgotten; `u` [3, N]: the normals that `motion.sample` made the poses of; and what
+    belongs to the map."""
 
     pose: jax.Array
     landmarks: Landmarks
     density: jax.Array
     match: jax.Array
+    birth: jax.Array
     log_choice: jax.Array
     counts: jax.Array
     u: jax.Array
+    bounds: gate.Bounds
+    ancestry: ancestry.Ancestry | None
 
 
-def observe(pose, world, chance, odometry, measurements, params, config, number, frozen=False):
-    """`Observed` of N particles; `pose` [3, N] is from before the motion, `number` the step's.
+def observe(state, chance, odometry, measurements, params, config, frozen=False):
+    """`Observed` of the N particles of a `filter.State` from before the motion.
 
     `frozen`: for derivatives by `params` poses are what was drawn, whatever drew them, and the
     density's derivative is that of the measurements alone (see `likelihood`).
     """
     hold = jax.lax.stop_gradient if frozen else lambda value: value
-    n, size = config.particles, block_size(config)
+    pose, n = state.pose, config.particles
     measurements = sensors.rescaled(measurements, params)
     params = params._replace(sigma_bearing=geometry.norm(params.sigma_bearing, params.caution))
     if not config.clutter:
@@ -54,43 +72,206 @@ def observe(pose, world, chance, odometry, measurements, params, config, number,
     u = jnp.zeros_like(pose) if config.proposal == "informed" else chance.normals
     predicted = hold(jnp.stack(motion.sample(pose, odometry, params, u)))
     sensor_pose = jnp.stack(sensors.pose_of(tuple(predicted), params))
+    rows = _concerned(state, predicted, sensor_pose, odometry, measurements, params, config)
+    rows &= measurements.active
+    world, past, rows = _caught_up(state, rows, config)
+    free = jnp.nonzero(~state.bounds.used, size=config.measurements, fill_value=config.landmarks)[0]
     particles = pose, predicted, sensor_pose, chance.normals, chance.picks
-    frame = odometry, measurements, params, number
-
-    def block(i, carry):
-        mine = jax.tree.map(
-            lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, i * size, size, -1),
-            (particles, carry.landmarks),
+    frame = odometry, measurements, params, free, state.step
+    match = jnp.full((config.measurements, n), association.PADDING, jnp.int32)
+    zero = jnp.zeros(n, pose.dtype)
+    counts = jnp.zeros((2, n), jnp.int32)
+    seen = _Block(predicted, world, zero, match, match, zero, counts, chance.normals)
+    seen = seen, jax.lax.stop_gradient(gate.nowhere(config, pose.dtype))
+    for size, chosen in _sizes(config, rows.sum()):
+        seen = _blocks(seen, particles, rows, frame, config, hold, size, chosen)
+    seen, found = seen
+    if past is not None:  # what was free has nothing to catch up with
+        past = past._replace(
+            chain=jnp.where(found.used & ~state.bounds.used, ancestry.CURRENT, past.chain)
         )
+    touched = rows | found.used
+    bounds = jax.tree.map(lambda new, old: jnp.where(touched, new, old), found, state.bounds)
+    return Observed(*seen, bounds, past)
+
+
+class _Block(NamedTuple):
+    """The parts of `Observed` that are worked out block by block."""
+
+    pose: jax.Array
+    landmarks: Landmarks
+    density: jax.Array
+    match: jax.Array
+    birth: jax.Array
+    log_choice: jax.Array
+    counts: jax.Array
+    u: jax.Array
+
+
+def _concerned(state, predicted, sensor_pose, odometry, measurements, params, config):
+    """Slots [M] to look at."""
+    extra = 0.0
+    if config.proposal == "informed":
+        axes = proposal.axes(state.pose, predicted, sensor_pose, odometry, params)
+        extra = jnp.max(sum(x * x + y * y for x, y, _ in axes))
+    given = state.bounds, sensor_pose, measurements, params, extra
+    return gate.concerned(config, *jax.lax.stop_gradient(given))
+
+
+def _caught_up(state, rows, config):
+    """The map with these slots [M] where their particles are, and its ancestry.
+
+    Particles that used a slot out of sight may have no descendants left: when slots run short, now
+    and then all are looked at.
+    """
+    looked = rows
+    if config.association != "known":
+        short = (~state.bounds.used).sum() < config.measurements
+        looked = rows | (state.bounds.used & short & (state.step % SWEEP == 0))
+    world, past = state.landmarks, state.ancestry
+    if past is not None:
+        world, past = ancestry.update(world, past, looked | ancestry.last_of(past))
+    return world, past, looked
+
+
+def _sizes(config, count):
+    """Numbers of slots that a block may look at, and which to go with: the smallest that `count`
+    fits in."""
+    total, size, sizes = config.landmarks, SMALLEST, []
+    if config.association == "known" and not config.forgetting and config.measurements < total:
+        yield config.measurements, True
+        return
+    while size < total:
+        sizes.append(size)
+        size *= 4
+    least = -1
+    for size in (*sizes, total):
+        yield size, (least < count) & (count <= size)
+        least = size
+
+
+def _widths(config):
+    """(start, width, rounds) of blocks that make up all particles: even ones, and perhaps a rest.
+
+    A whole number of blocks, if one not much smaller than `block` allows it, is compiled once.
+    """
+    n, most = config.particles, min(config.block, config.particles)
+    width = next((w for w in range(most, most // 2, -1) if n % w == 0), most)
+    yield 0, width, n // width
+    if n % width:
+        yield n - n % width, n % width, 1
+
+
+def _blocks(whole, particles, rows, frame, config, hold, size, chosen):
+    """`_Block` of all particles, each with `size` of the slots, if that is `chosen`."""
+    total = len(rows)
+    odometry, measurements, params, free, number = frame
+    named = measurements
+    slots = jnp.arange(total, dtype=jnp.int32)
+    if size < total:
+        slots = jnp.nonzero(rows, size=size, fill_value=total)[0].astype(jnp.int32)
+        local = jnp.full(total, size, jnp.int32)
+        local = local.at[slots].set(jnp.arange(size, dtype=jnp.int32), mode="drop")
+        identity = jnp.clip(measurements.identity, 0, total - 1)
+        there = (measurements.identity >= 0) & (measurements.identity < total)
+        measurements = measurements._replace(identity=jnp.where(there, local[identity], size))
+
+    def block(i, carry, first, width):
+        carry, bounds = carry
+        start = first + i * width
+        mine = jax.tree.map(
+            lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, width, -1), particles
+        )
+        before = _taken(carry.landmarks, slots, rows.sum(), start, width)
         # Inside a branch the slices are arrays of their own. Fused into the arithmetic, in-place
         # reading and writing of the large arrays stops its vectorisation: ten times slower.
         done = jax.lax.cond(
             measurements.active,
-            lambda mine: _look(*mine, *frame, config, hold),
-            lambda mine: _nothing(*mine, *frame, config, hold),
+            lambda *mine: _look(*mine, odometry, measurements, params, config, hold),
+            lambda *mine: _nothing(*mine, odometry, params, config, hold),
             mine,
+            before,
         )
+        if size < total:
+            at = slots[jnp.clip(done.match, 0, size - 1)]
+            done = done._replace(match=jnp.where(done.match >= 0, at, done.match))
+        rest = jax.tree.map(
+            lambda leaf, new: jax.lax.dynamic_update_slice_in_dim(leaf, new, start, -1),
+            carry._replace(landmarks=None),
+            done._replace(landmarks=None),
+        )
+        fixed = dict(anchor=None, birth=None)  # what a look leaves as it is
+        world = _put(
+            carry.landmarks._replace(**fixed), done.landmarks._replace(**fixed), slots,
+            rows.sum(), start,
+        )._replace(anchor=carry.landmarks.anchor, birth=carry.landmarks.birth)  # fmt: skip
+        at = tuple(sensors.pose_of(tuple(done.pose), params))
+        bounds = gate.widened(bounds, jax.lax.stop_gradient(done.landmarks), slots)
+        world, born, lost = births.create(
+            config, world, start, at, done.match, free, named, params, number
+        )
+        counts = jax.lax.dynamic_update_slice_in_dim(rest.counts, lost[None], start, -1)
+        return rest._replace(landmarks=world, counts=counts), gate.unlimited(bounds, born)
+
+    for first, width, rounds in _widths(config):
+        whole = jax.lax.fori_loop(
+            0,
+            rounds if total <= SMALLEST else jnp.where(chosen, rounds, 0),
+            partial(block, first=first, width=width),
+            whole,
+        )
+    return whole
+
+
+def _taken(world, slots, count, start, width):
+    """The first `count` of `slots` of `width` particles from `start` on; the others are empty."""
+    if len(slots) == len(world.count):
         return jax.tree.map(
-            lambda whole, new: jax.lax.dynamic_update_slice_in_dim(whole, new, i * size, -1),
-            carry,
-            done,
+            lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, width, -1),
+            world,
         )
 
-    match = jnp.full((config.measurements, n), association.PADDING, jnp.int32)
-    zero = jnp.zeros(n, pose.dtype)
-    counts = jnp.zeros((2, n), jnp.int32)
-    start = Observed(predicted, world, zero, match, zero, counts, chance.normals)
-    return jax.lax.fori_loop(0, n // size, block, start)
+    def one(i, parts):
+        def take(leaf, part):
+            at = _corner(leaf, slots[i], start)
+            row = jax.lax.dynamic_slice(leaf, at, (*leaf.shape[:-2], 1, width))
+            return jax.lax.dynamic_update_slice_in_dim(part, row, i, leaf.ndim - 2)
+
+        return jax.tree.map(take, world, parts)
+
+    empty = jax.tree.map(
+        lambda leaf: jnp.zeros((*leaf.shape[:-2], len(slots), width), leaf.dtype),
+        world,
+    )
+    return jax.lax.fori_loop(0, count, one, empty)
 
 
-def block_size(config):
-    """The largest divisor of the number of particles that is no larger than the block."""
-    n = config.particles
-    return next(size for size in range(min(config.block, n), 0, -1) if n % size == 0)
+def _corner(leaf, slot, start):
+    """Where a block's row begins; indices of one type, also in double precision."""
+    return tuple(jnp.asarray(i, jnp.int32) for i in (*(0,) * (leaf.ndim - 2), slot, start))
 
 
-def _nothing(particles, world, odometry, measurements, params, number, config, hold):
-    """`Observed` of a block in a frame without a look: it moves."""
+def _put(world, part, slots, count, start):
+    """The map with what `_taken` took replaced."""
+    if len(slots) == len(world.count):
+        return jax.tree.map(
+            lambda leaf, new: jax.lax.dynamic_update_slice_in_dim(leaf, new, start, -1),
+            world,
+            part,
+        )
+
+    def one(i, leaves):
+        def put(leaf, new):
+            row = jax.lax.dynamic_slice_in_dim(new, i, 1, new.ndim - 2)
+            return jax.lax.dynamic_update_slice(leaf, row, _corner(leaf, slots[i], start))
+
+        return jax.tree.map(put, leaves, part)
+
+    return jax.lax.fori_loop(0, count, one, world)
+
+
+def _nothing(particles, before, odometry, params, config, hold):
+    """`_Block` in a frame without a look: it moves."""
     pose, predicted, _, normals, _ = particles
     if config.proposal == "informed":
         predicted = hold(jnp.stack(motion.sample(pose, odometry, params, normals)))
@@ -98,11 +279,11 @@ def _nothing(particles, world, odometry, measurements, params, number, config, h
     match = jnp.full((config.measurements, size), association.PADDING, jnp.int32)
     zero = jnp.zeros(size, pose.dtype)
     counts = jnp.zeros((2, size), jnp.int32)
-    return Observed(predicted, world, zero, match, zero, counts, normals)
+    return _Block(predicted, before, zero, match, match, zero, counts, normals)
 
 
-def _look(particles, before, odometry, measurements, params, number, config, hold):
-    """`Observed` of a block: associate, move (when informed), weigh and update, create, forget."""
+def _look(particles, before, odometry, measurements, params, config, hold):
+    """`_Block`: associate, move (when informed), weigh and update, forget."""
     pose, predicted, sensor_pose, normals, picks = particles
     sensor, informed = config.sensor, config.proposal == "informed"
     noise = sensors.correlated(params, odometry)
@@ -127,23 +308,23 @@ def _look(particles, before, odometry, measurements, params, number, config, hol
         predicted = hold(jnp.stack(motion.sample(pose, odometry, params, u)))
         sensor_pose = jnp.stack(sensors.pose_of(tuple(predicted), params))
     world, density = landmarks.update_matched(
-        sensor, tuple(sensor_pose), before, match, measurements, noise
-    )
+        sensor, tuple(sensor_pose), before, match, measurements, noise,
+        again=config.association == "known" or not config.exclusive,
+    )  # fmt: skip
     density = density + jnp.where(match == NEW, new[:, None], 0).sum(0)
     if config.clutter:
         density = density + jnp.where(match == CLUTTER, clutter, 0).sum(0)
     if config.even:
         density = density - _orders(count, (match >= 0).sum(0))
-    world, overflow = landmarks.create(
-        config, tuple(sensor_pose), world, match, measurements, params, number
-    )
-    forgotten = jnp.zeros_like(overflow)
+    forgotten = jnp.zeros_like(match[0])
     if config.forgetting:
         world, forgotten = landmarks.existence(world, seen, params)
-    counts = jnp.stack([overflow, forgotten]).astype(jnp.int32)
+    counts = jnp.stack([jnp.zeros_like(forgotten), forgotten]).astype(jnp.int32)
     density = density + log_ratio - log_choice
     world = landmarks.settle(world)
-    return Observed(predicted, world, density, match, log_choice, counts, u)
+    birth = jnp.take_along_axis(world.birth, jnp.maximum(match, 0), 0)
+    birth = jnp.where(match >= 0, birth, match)
+    return _Block(predicted, world, density, match, birth, log_choice, counts, u)
 
 
 def _orders(count, matched):

@@ -83,6 +83,7 @@ def run(log, config=None, params=None, seed=0, progress=None, refine=True):
     compile_seconds = time.perf_counter() - begin
     state, summary, tree = _filtered(steps, key, state, data, numbers, config, progress)
     best = int(summary.survivor[-1])
+    state = fastslam.settled(state)
     world = _map(state, best, numbers, config, data.identities, origin)
     looking_back = _looking_back(tree, state.log_weight, best, origin)
     seconds = time.perf_counter() - begin - compile_seconds

@@ -31,10 +31,9 @@ def make_log(**changes):
 
 
 def settings(config):
-    """All but `block`, which decides the speed alone."""
+    """All but what decides the speed alone."""
     values = dataclasses.asdict(config)
-    del values["block"]
-    return values
+    return {k: v for k, v in values.items() if k not in ("block", "lazy", "chains")}
 
 
 def test_defaults():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from jaxslam import association, baseline_ekf, geometry, landmarks, sensors
+from jaxslam import association, baseline_ekf, births, geometry, landmarks, sensors
 from jaxslam.baseline import make_model
 from jaxslam.config import SENSORS, Config, default_params
 from jaxslam.sensors import Measurements
@@ -319,7 +319,7 @@ def test_matched_landmarks_are_updated_marked_and_weighed(x64, sensor):
     # The last two measurements share a landmark in the second particle.
     match = jnp.array([[1, -1], [-2, 2], [0, 2], [-3, -3]])
     frame = frame_of(sensor, world, match)
-    got, density = landmarks.update_matched(sensor, poses(2), world, match, frame, PARAMS)
+    got, density = landmarks.update_matched(sensor, poses(2), world, match, frame, PARAMS, True)
     for n in range(2):
         total = 0.0
         mean, factor = np.array(world.mean[:, :, n]), np.array(world.factor[:, :, n])
@@ -343,30 +343,45 @@ def test_matched_landmarks_are_updated_marked_and_weighed(x64, sensor):
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
-def test_births_take_the_lowest_free_slot_in_the_measurements_order(x64, sensor):
-    config = Config(sensor=sensor, particles=3, landmarks=4, measurements=4)
-    #                     two free   full      one free, after a match (marked)
-    world = world_of(sensor, [[1, 1, -3], [0, 2, 1], [7, 1, 0], [0, 1, 1]])
-    match = jnp.array([[-1, -1, -1], [-1, -1, -2], [-1, 0, -1], [-3, -3, -3]])
+def test_births_take_slots_that_no_particle_uses_in_the_measurements_order(x64, sensor):
+    config = Config(sensor=sensor, particles=5, landmarks=5, measurements=4)
+    world = world_of(sensor, [[1, 1, 1], [0, 0, 0], [7, 1, 0], [0, 1, 1], [0, 0, 0]])
+    match = jnp.array([[-1, -1, -1], [-1, -2, -1], [-2, 0, -1], [-3, -3, -3]])
     frame = frame_of(sensor, world, match)
-    got, overflow = landmarks.create(config, poses(3), world, match, frame, PARAMS, 10)
-    np.testing.assert_array_equal(overflow, [1, 2, 1])
-    np.testing.assert_array_equal(got.count, [[1, 1, -3], [-1, 2, 1], [7, 1, -1], [-1, 1, 1]])
-    for slot, lane, k in ((1, 0, 0), (3, 0, 1), (2, 2, 0)):
+    free = jnp.array([1, 4, 5, 5])  # slot 3 is in use elsewhere
+    whole = jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, 0)] * (leaf.ndim - 1) + [(1, 1)]), world)
+    whole, touched, lost = births.create(config, whole, 1, poses(3), match, free, frame, PARAMS, 10)
+    got = jax.tree.map(lambda leaf: leaf[..., 1:-1], whole)
+    np.testing.assert_array_equal(whole.count[:, [0, -1]], 0)
+    np.testing.assert_array_equal(lost, [0, 0, 1])
+    np.testing.assert_array_equal(touched, [False, True, False, False, True])
+    expected = [[1, 1, 1], [1, 1, 1], [7, 1, 0], [0, 1, 1], [1, 0, 1]]
+    np.testing.assert_array_equal(got.count, expected)
+    for slot, lane, k in ((1, 0, 0), (4, 0, 1), (1, 1, 0), (1, 2, 0), (4, 2, 1)):
         mean, factor, anchor = sensors.locate(
             sensor, tuple(SENSOR_POSE), tuple(frame.value[k]), COV, PARAMS
         )
         np.testing.assert_allclose(got.mean[:, slot, lane], mean, atol=1e-12)
         np.testing.assert_allclose(got.factor[:, slot, lane], factor, atol=1e-12)
         assert int(got.birth[slot, lane]) == 10 * 4 + k
-        born = float(got.log_odds[slot, lane])
-        assert born == pytest.approx(PARAMS.existence_new - PARAMS.existence_seen)
+        assert float(got.log_odds[slot, lane]) == pytest.approx(PARAMS.existence_new)
         if sensor == "bearing":
             np.testing.assert_allclose(got.anchor[:, slot, lane], anchor)
-    kept = np.array([[1, 1, 1], [0, 1, 1], [1, 1, 0], [0, 1, 1]], bool)
+    kept = np.array([[1, 1, 1], [0, 0, 0], [1, 1, 1], [1, 1, 1], [0, 1, 0]], bool)
     for name in ("mean", "factor", "log_odds", "birth"):
         old, new = (np.asarray(getattr(w, name))[..., kept] for w in (world, got))
         np.testing.assert_array_equal(new, old)
+
+
+def test_what_has_odds_against_it_from_the_start_is_no_landmark(x64):
+    config = Config(sensor="range_bearing", particles=2, landmarks=1, measurements=1)
+    world = world_of("range_bearing", [[0, 0]])
+    match = jnp.array([[-1, -1]])
+    frame = frame_of("range_bearing", world, match)
+    params = PARAMS._replace(existence_new=-0.1)
+    free = jnp.array([0])
+    got, *_ = births.create(config, world, 0, poses(2), match, free, frame, params, 0)
+    np.testing.assert_array_equal(got.count, [[0, 0]])
 
 
 def test_known_identities_go_to_their_slot(x64):
@@ -375,9 +390,10 @@ def test_known_identities_go_to_their_slot(x64):
     match = jnp.array([[-1, -1], [0, -1], [-1, -1], [-3, -3]])
     frame = frame_of("range_bearing", world, match)
     frame = frame._replace(identity=jnp.array([2, 0, 5, -1], jnp.int32))
-    got, overflow = landmarks.create(config, poses(2), world, match, frame, PARAMS, 1)
-    np.testing.assert_array_equal(got.count, [[1, -1], [0, 0], [-1, -1]])
-    np.testing.assert_array_equal(overflow, [1, 1])  # identity 5 has no slot
+    got, touched, lost = births.create(config, world, 0, poses(2), match, None, frame, PARAMS, 1)
+    np.testing.assert_array_equal(got.count, [[1, 1], [0, 0], [1, 1]])
+    np.testing.assert_array_equal(lost, [1, 1])  # identity 5 has no slot
+    np.testing.assert_array_equal(touched, [True, False, True])
     np.testing.assert_array_equal(got.birth[2], [4, 4])
     assert int(got.birth[0, 1]) == 5
     assert got.log_odds is None
@@ -438,7 +454,7 @@ def test_a_given_map_fills_the_first_slots_of_every_particle(x64, sensor):
     rng = np.random.default_rng(0)
     given = rng.normal(size=(2, 2)), rng.uniform(0.1, 1, (3, 2)), rng.normal(size=(2, 2))
     given = given if sensor == "bearing" else given[:2]
-    world = landmarks.fill(landmarks.empty(config, jnp.zeros(()).dtype), given)
+    world = births.given(landmarks.empty(config, jnp.zeros(()).dtype), given)
     for n in range(3):
         np.testing.assert_array_equal(world.mean[:, :2, n], given[0])
         np.testing.assert_array_equal(world.factor[:, :2, n], given[1])
@@ -453,7 +469,7 @@ def test_a_given_map_fills_the_first_slots_of_every_particle(x64, sensor):
 def test_a_given_map_must_fit():
     world = landmarks.empty(Config(particles=2, landmarks=1), jnp.float32)
     with pytest.raises(ValueError, match="2 landmarks given, but the map has 1 slots"):
-        landmarks.fill(world, (np.zeros((2, 2)), np.ones((3, 2))))
+        births.given(world, (np.zeros((2, 2)), np.ones((3, 2))))
 
 
 # --- one map for all particles

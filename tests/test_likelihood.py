@@ -1,5 +1,7 @@
 """The score of the log likelihood: its modes agree, its memory stays, and what it refuses."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -70,18 +72,17 @@ def backwards(params, data, config, names, discount):
     Poses are held and judged by `motion.log_density`; weights, draws and ancestors are held.
     """
     start, key = jax.random.split(KEY)
+    eager = dataclasses.replace(config, lazy=False)
     hold = jax.lax.stop_gradient
 
     def total(values):
         given = params._replace(**values)
-        state = fastslam.init(config, start, *data[:2], data.landmarks_given)
+        state = fastslam.init(eager, start, *data[:2], data.landmarks_given)
 
         def step(carry, frame):
             state, inherited = carry
             chance = likelihood.draws(key, state.step, config)
-            seen = observation.observe(
-                state.pose, state.landmarks, chance, *frame, given, config, state.step, True
-            )
+            seen = observation.observe(state, chance, *frame, given, config, True)
             drawn = motion.log_density(hold(seen.pose), hold(state.pose), frame[0], given)
             own = discount * inherited + seen.density + drawn
             after, info = fastslam.conclude(chance, *hold((state, seen)), frame[1].active, config)

@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxslam import births, runner
 from jaxslam import filter as fastslam
-from jaxslam import landmarks as maps
-from jaxslam import runner
 from jaxslam.config import Config, default_params
 from jaxslam.evaluate import ate
 from jaxslam.runner import config_for, refined
@@ -91,7 +90,7 @@ def test_landmarks_without_a_depth_stay_out_of_the_map():
     state = fastslam.init(config, jax.random.key(0))
     depth, sd = jnp.array([0.5, 0.5, 0.5]), jnp.array([0.01, 0.25, 0.01])
     given = jnp.stack([jnp.zeros(3), depth]), jnp.stack([jnp.full(3, 0.01), jnp.zeros(3), sd])
-    world = maps.fill(state.landmarks, (*given, jnp.ones((2, 3))))
+    world = births.given(state.landmarks, (*given, jnp.ones((2, 3))))
     # The third slot is empty.
     world = world._replace(
         count=world.count.at[2].set(0), birth=jnp.array([[7, 7], [8, 8], [9, 9]], jnp.int32)
