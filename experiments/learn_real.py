@@ -5,9 +5,11 @@
 
 *Lost in the Woods*: learnt on the first half, judged on the second, and the other way round; the
 maps that judge are made with identities hidden. MRCLAM dataset 6: learnt on three robots, judged on
-the other two. Ranges and bearings; learnt with identities known. Judged: the held-out evidence, and
-the errors of `jaxslam.run` with 1,000 particles, with the defaults, with what was published with
-the data, and with what was learnt. Learning never sees truth; windows start with an empty map.
+the other two. Ranges and bearings; learnt with identities known. Frames learnt from are 1 s apart,
+MRCLAM's 3 s: its robots follow commands late, so that from frame to frame they turn less than they
+do in the end. Judged: the held-out evidence, and the errors of `jaxslam.run` with 1,000 particles
+and the informed proposal, with the defaults, with what was published with the data, and with what
+was learnt. Learning never sees truth; windows start with an empty map.
 Writes experiments/results/learn_real.md and .json, and experiments/params/learnt_*.toml.
 MRCLAM may not be redistributed: read from ../shared/data/mrclam, or left out.
 """
@@ -24,6 +26,7 @@ import batch
 import jax
 import numpy as np
 
+from calibration.odometry import fit_odometry
 from jaxslam import config_for, default_params, learn, load_log, run, save_params, uncertainty
 from jaxslam.evaluate import errors
 from jaxslam.parts import cut, spaced, windows
@@ -32,7 +35,10 @@ RESULTS = Path(__file__).parent / "results"
 PARAMS = Path(__file__).parent / "params"
 NAMES = ("err_tran", "err_rot", "err_drift", "floor_tran", "floor_rot", "gain_tran", "gain_rot")
 NAMES += ("mount_yaw", "sigma_range", "sigma_bearing", "growth", "outlier")
-CURVED = (*NAMES, "bias_drift")  # commanded drives bend to one side
+# Commanded drives bend to one side; where the camera looks is each robot's own; and what a glimpse
+# of one or two landmarks every 3 s leaves open is not asked.
+LEFT = ("mount_yaw", "floor_tran", "floor_rot")
+CURVED = (*(name for name in NAMES if name not in LEFT), "bias_drift")
 # The course's standard deviations of speed and yaw rate, every 0.1 s, as noise per time.
 WOODS_PUBLISHED = dict(
     sigma_range=0.030, sigma_bearing=0.0259, growth=0.0, floor_tran=0.0665 * 0.1**0.5,
@@ -53,6 +59,7 @@ class Case(NamedTuple):
     window: float  # s
     spacing: float  # s between the frames learnt from: errors of close ones are alike
     names: tuple = NAMES
+    particles: int = 200
 
 
 def cases():
@@ -63,11 +70,11 @@ def cases():
     yield Case("woods-second", [second], [first], "maximum_likelihood", WOODS_PUBLISHED, 630.0, 1.0)
     robots = [batch.mrclam(robot)[0] for robot in range(1, 6)]
     if robots[0] is not None:
-        yield Case("mrclam-123", robots[:3], robots[3:], None, None, 450.0, 0.0, CURVED)
-        yield Case("mrclam-345", robots[2:], robots[:2], None, None, 450.0, 0.0, CURVED)
+        yield Case("mrclam-123", robots[:3], robots[3:], None, None, 450.0, 3.0, CURVED, 400)
+        yield Case("mrclam-345", robots[2:], robots[:2], None, None, 450.0, 3.0, CURVED, 400)
 
 
-def model(logs, particles=200):
+def model(logs, particles):
     """The configuration to learn with: one for all logs of a case."""
     made = [config_for(log, "range_bearing", "known") for log in logs]
     return config_for(
@@ -83,7 +90,7 @@ def learnt(case, seed, steps):
         [spaced(part, case.spacing) for log in logs for part in windows(log, case.window)]
         for logs in (case.train, case.judged)
     )
-    config = model([*parts, *judged])
+    config = model([*parts, *judged], case.particles)
     start = default_params("range_bearing", case.train[0])
     begin = time.perf_counter()
 
@@ -95,8 +102,7 @@ def learnt(case, seed, steps):
 
     fit = learn.fit(
         parts, config, start, case.names, held_out=judged, seeds=2 if len(parts) < 3 else 1,
-        batch=3, steps=steps, rate=0.15,
-        every=15, held_out_seeds=2, seed=seed, progress=tell,
+        steps=steps, rate=0.15, every=15, held_out_seeds=2, seed=seed, progress=tell,
     )  # fmt: skip
     return fit, judged, parts
 
@@ -106,7 +112,7 @@ def judge(case, params, seeds):
     association = "known" if case.hidden is None else case.hidden
     found = {}
     for log in case.judged:
-        config = config_for(log, "range_bearing", association)
+        config = config_for(log, "range_bearing", association, proposal="informed")
         # What a log declares of its view is its own, whatever was learnt elsewhere.
         own = default_params("range_bearing", log)
         view = {n: getattr(own, n) for n in ("view_min", "view_max", "view_range")}
@@ -133,6 +139,9 @@ def assessed(case, steps, seeds):
             n: [getattr(fit.start, n), getattr(fit.params, n), known.get(n), verdict]
             for n, verdict in zip(fit.names, found.verdict, strict=True)
         },
+        "true_gain_rot": [
+            fit_odometry(log, case.spacing)[0].get("gain_rot") for log in case.train
+        ],
         "made": found.made, "log_z_sd": found.log_z_sd, "seconds": fit.seconds,
         "steps": fit.steps, "unresolved": list(found.unresolved),
         "evidence": {
@@ -160,7 +169,12 @@ def table(results):
         for n, (start, value, error, verdict) in found["values"].items():
             error = "-" if error is None else f"{error:.2g}"
             yield f"| {n} | {start:.4g} | {value:.4g} | {error} | {verdict} |"
-        yield from ["", *found["unresolved"], ""]
+        gains = ", ".join("?" if gain is None else f"{gain:.3f}" for gain in found["true_gain_rot"])
+        yield from [
+            "",
+            f"True poses as far apart as the frames learnt from give gain_rot {gains}.\n",
+        ]
+        yield from [*found["unresolved"], ""]
         yield (
             "Held-out evidence [nats], mean over seeds: "
             + ", ".join(f"{n} {np.mean(v):.0f}" for n, v in evidence.items())
@@ -185,7 +199,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--cases", nargs="+", help="names of the cases to run")
-    parser.add_argument("--steps", type=int, default=45)
+    parser.add_argument("--steps", type=int, default=60)
     args = parser.parse_args()
     jax.config.update("jax_num_cpu_devices", os.cpu_count())
     file = RESULTS / "learn_real.json"

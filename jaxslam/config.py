@@ -26,7 +26,8 @@ class Config:
     beforehand to be the one measured, so that a match counts 1 / n; without it a landmark held
     twice would be twice as likely (`sampled` only). `block`: particles worked on at once, so that
     temporaries stay in cache; `lazy`: landmarks are copied to a particle's descendants when next
-    looked at, with at most `chains` ancestries to keep; of these only `block` makes a difference to the result, that of rounding.
+    looked at, with at most `chains` ancestries to keep; of these only `block` makes a difference to
+    the result, that of rounding.
 
     Raises `ValueError` for a value that is not allowed.
     """
