@@ -77,7 +77,7 @@ def jax_contender(marks, config, donated):
         state, info = jax.block_until_ready(step(key, state, odometry, frame, params, config))
         return info.estimate.mean
 
-    return advance, lambda: float((state.landmarks.count > 0).sum(0).mean())
+    return advance, lambda: float((fastslam.settled(state).landmarks.count > 0).sum(0).mean())
 
 
 def numpy_contender(marks, config, block):

@@ -17,6 +17,7 @@ from jaxslam import (
     gate,
     geometry,
     landmarks,
+    matched,
     motion,
     proposal,
     sensors,
@@ -307,7 +308,7 @@ def _look(particles, before, odometry, measurements, params, config, hold):
         u, log_ratio = hold(proposal.draw(whitened, normals))
         predicted = hold(jnp.stack(motion.sample(pose, odometry, params, u)))
         sensor_pose = jnp.stack(sensors.pose_of(tuple(predicted), params))
-    world, density = landmarks.update_matched(
+    world, density = matched.updated(
         sensor, tuple(sensor_pose), before, match, measurements, noise,
         again=config.association == "known" or not config.exclusive,
     )  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from jaxslam import association, baseline_ekf, births, geometry, landmarks, sensors
+from jaxslam import association, baseline_ekf, births, geometry, landmarks, matched, sensors
 from jaxslam.baseline import make_model
 from jaxslam.config import SENSORS, Config, default_params
 from jaxslam.sensors import Measurements
@@ -319,7 +319,7 @@ def test_matched_landmarks_are_updated_marked_and_weighed(x64, sensor):
     # The last two measurements share a landmark in the second particle.
     match = jnp.array([[1, -1], [-2, 2], [0, 2], [-3, -3]])
     frame = frame_of(sensor, world, match)
-    got, density = landmarks.update_matched(sensor, poses(2), world, match, frame, PARAMS, True)
+    got, density = matched.updated(sensor, poses(2), world, match, frame, PARAMS, True)
     for n in range(2):
         total = 0.0
         mean, factor = np.array(world.mean[:, :, n]), np.array(world.factor[:, :, n])
