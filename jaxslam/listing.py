@@ -1,5 +1,6 @@
-"""Where masks are true, fast on a CPU."""
+"""Where masks are true, fast on a CPU; and loops over as many."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -24,3 +25,10 @@ def listed(mask, size=None):
     to = jnp.where(mask, place, size)
     index = jnp.full(size, n, jnp.int32).at[to].set(jnp.arange(n, dtype=jnp.int32), mode="drop")
     return index, count
+
+
+def rounds(count, body, start):
+    """`jax.lax.fori_loop` from 0 to a count worked out."""
+    return jax.lax.while_loop(
+        lambda carry: carry[0] < count, lambda carry: (carry[0] + 1, body(*carry)), (0, start)
+    )[1]

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.landmarks import update
-from jaxslam.listing import listed
+from jaxslam.listing import listed, rounds
 
 
 def updated(sensor, sensor_pose, world, match, measurements, params, again):
@@ -78,8 +78,8 @@ def _read(world, slot):
         return put(found, k, jax.tree.map(lambda leaf: leaf[..., at, lane], parts))
 
     found = jax.tree.map(lambda leaf: jnp.ones((*leaf.shape[:-2], *slot.shape), leaf.dtype), parts)
-    found = _rounds(count, one, found)
-    return _rounds(rest, other, found)
+    found = rounds(count, one, found)
+    return rounds(rest, other, found)
 
 
 def _write(world, slot, new):
@@ -112,13 +112,6 @@ def _write(world, slot, new):
             new,
         )
 
-    leaves = _rounds(count, one, (world.mean, world.factor, world.count))
-    mean, factor, count = _rounds(rest, other, leaves)
+    leaves = rounds(count, one, (world.mean, world.factor, world.count))
+    mean, factor, count = rounds(rest, other, leaves)
     return world._replace(mean=mean, factor=factor, count=count)
-
-
-def _rounds(count, body, start):
-    """`jax.lax.fori_loop` from 0 to a count worked out."""
-    return jax.lax.while_loop(
-        lambda carry: carry[0] < count, lambda carry: (carry[0] + 1, body(*carry)), (0, start)
-    )[1]

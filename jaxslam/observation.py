@@ -24,6 +24,7 @@ from jaxslam import (
 )
 from jaxslam.association import CLUTTER, NEW
 from jaxslam.landmarks import Landmarks
+from jaxslam.listing import rounds
 
 SWEEP = 16  # steps
 SMALLEST = gate.FEW  # slots of which a block takes copies; four times as many, and so on, or all
@@ -152,7 +153,7 @@ def _sizes(config, count):
 
 
 def _widths(config):
-    """(start, width, rounds) of blocks that make up all particles: even ones, and perhaps a rest.
+    """(start, width, number) of blocks that make up all particles: even ones, and perhaps a rest.
 
     A whole number of blocks, if one not much smaller than `block` allows it, is compiled once.
     """
@@ -214,10 +215,10 @@ def _blocks(whole, particles, rows, frame, config, hold, size, chosen):
         counts = jax.lax.dynamic_update_slice_in_dim(rest.counts, lost[None], start, -1)
         return rest._replace(landmarks=world, counts=counts), gate.unlimited(bounds, born)
 
-    for first, width, rounds in _widths(config):
+    for first, width, blocks in _widths(config):
         whole = jax.lax.fori_loop(
             0,
-            rounds if total <= SMALLEST else jnp.where(chosen, rounds, 0),
+            blocks if total <= SMALLEST else jnp.where(chosen, blocks, 0),
             partial(block, first=first, width=width),
             whole,
         )
@@ -244,7 +245,7 @@ def _taken(world, slots, count, start, width):
         lambda leaf: jnp.zeros((*leaf.shape[:-2], len(slots), width), leaf.dtype),
         world,
     )
-    return jax.lax.fori_loop(0, count, one, empty)
+    return rounds(count, one, empty)
 
 
 def _corner(leaf, slot, start):
@@ -268,7 +269,7 @@ def _put(world, part, slots, count, start):
 
         return jax.tree.map(put, leaves, part)
 
-    return jax.lax.fori_loop(0, count, one, world)
+    return rounds(count, one, world)
 
 
 def _nothing(particles, before, odometry, params, config, hold):
