@@ -22,6 +22,7 @@ from jaxslam import (
     proposal,
     sensors,
 )
+from jaxslam.ancestry import Ancestry
 from jaxslam.association import CLUTTER, NEW
 from jaxslam.landmarks import Landmarks
 from jaxslam.listing import rounds
@@ -44,7 +45,7 @@ class Observed(NamedTuple):
     over what pose and associations were drawn from; `match` and `birth` [K, N] (`filter.Info`);
     `log_choice` [N], log probability of the draw; `counts` [2, N]: landmarks lost for want of a
     slot, and forgotten; `u` [3, N]: the normals that `motion.sample` made the poses of; and what
-    belongs to the map."""
+    belongs to the map (None of a block of particles alone)."""
 
     pose: jax.Array
     landmarks: Landmarks
@@ -54,8 +55,8 @@ class Observed(NamedTuple):
     log_choice: jax.Array
     counts: jax.Array
     u: jax.Array
-    bounds: gate.Bounds
-    ancestry: ancestry.Ancestry | None
+    bounds: gate.Bounds | None = None
+    ancestry: Ancestry | None = None
 
 
 def observe(state, chance, odometry, measurements, params, config, frozen=False):
@@ -83,7 +84,7 @@ def observe(state, chance, odometry, measurements, params, config, frozen=False)
     match = jnp.full((config.measurements, n), association.PADDING, jnp.int32)
     zero = jnp.zeros(n, pose.dtype)
     counts = jnp.zeros((2, n), jnp.int32)
-    seen = _Block(predicted, world, zero, match, match, zero, counts, chance.normals)
+    seen = Observed(predicted, world, zero, match, match, zero, counts, chance.normals)
     seen = seen, jax.lax.stop_gradient(gate.nowhere(config, pose.dtype))
     for size, chosen in _sizes(config, rows.sum()):
         seen = _blocks(seen, particles, rows, frame, config, hold, size, chosen)
@@ -94,20 +95,7 @@ def observe(state, chance, odometry, measurements, params, config, frozen=False)
         )
     touched = rows | found.used
     bounds = jax.tree.map(lambda new, old: jnp.where(touched, new, old), found, state.bounds)
-    return Observed(*seen, bounds, past)
-
-
-class _Block(NamedTuple):
-    """The parts of `Observed` that are worked out block by block."""
-
-    pose: jax.Array
-    landmarks: Landmarks
-    density: jax.Array
-    match: jax.Array
-    birth: jax.Array
-    log_choice: jax.Array
-    counts: jax.Array
-    u: jax.Array
+    return seen._replace(bounds=bounds, ancestry=past)
 
 
 def _concerned(state, predicted, sensor_pose, odometry, measurements, params, config):
@@ -165,7 +153,7 @@ def _widths(config):
 
 
 def _blocks(whole, particles, rows, frame, config, hold, size, chosen):
-    """`_Block` of all particles, each with `size` of the slots, if that is `chosen`."""
+    """`Observed` of all particles, each with `size` of the slots, if that is `chosen`."""
     total = len(rows)
     odometry, measurements, params, free, number = frame
     named = measurements
@@ -273,7 +261,7 @@ def _put(world, part, slots, count, start):
 
 
 def _nothing(particles, before, odometry, params, config, hold):
-    """`_Block` in a frame without a look: it moves."""
+    """`Observed` in a frame without a look: it moves."""
     pose, predicted, _, normals, _ = particles
     if config.proposal == "informed":
         predicted = hold(jnp.stack(motion.sample(pose, odometry, params, normals)))
@@ -281,11 +269,11 @@ def _nothing(particles, before, odometry, params, config, hold):
     match = jnp.full((config.measurements, size), association.PADDING, jnp.int32)
     zero = jnp.zeros(size, pose.dtype)
     counts = jnp.zeros((2, size), jnp.int32)
-    return _Block(predicted, before, zero, match, match, zero, counts, normals)
+    return Observed(predicted, before, zero, match, match, zero, counts, normals)
 
 
 def _look(particles, before, odometry, measurements, params, config, hold):
-    """`_Block`: associate, move (when informed), weigh and update, forget."""
+    """`Observed`: associate, move (when informed), weigh and update, forget."""
     pose, predicted, sensor_pose, normals, picks = particles
     sensor, informed = config.sensor, config.proposal == "informed"
     noise = sensors.correlated(params, odometry)
@@ -326,7 +314,7 @@ def _look(particles, before, odometry, measurements, params, config, hold):
     world = landmarks.settle(world)
     birth = jnp.take_along_axis(world.birth, jnp.maximum(match, 0), 0)
     birth = jnp.where(match >= 0, birth, match)
-    return _Block(predicted, world, density, match, birth, log_choice, counts, u)
+    return Observed(predicted, world, density, match, birth, log_choice, counts, u)
 
 
 def _orders(count, matched):
