@@ -202,7 +202,7 @@ def one_refined(given, config, seed):
     end = time.perf_counter()
     numbers = jax.tree.map(jnp.asarray, Params(*map(float, params)))
     table = maps.summarise(
-        fastslam.settled(state).landmarks, jnp.exp(state.log_weight), best, numbers, config
+        fastslam.settled(state, config).landmarks, jnp.exp(state.log_weight), best, numbers, config
     )
     table = jax.tree.map(np.asarray, table)
     keep = np.flatnonzero(table.kept)

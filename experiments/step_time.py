@@ -12,137 +12,48 @@ import json
 import os
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})  # before JAX and BLAS make their threads
 os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 os.environ |= {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
 
+import contenders
 import jax
-import jax.numpy as jnp
 import numpy as np
-import vectorised_numpy
 
-from jaxslam import baseline, baseline_ekf
-from jaxslam import filter as fastslam
-from jaxslam.config import Config, Params, default_params
-from jaxslam.motion import Odometry
-from jaxslam.sensors import Measurements
+from jaxslam.config import Config
 
 RESULTS = Path(__file__).parent / "results"
-DRIVE = Odometry(0.1, 0.0, 0.01, 0.1, 0.01, 0.2, 0.5, 1 / 12)  # 0.1 m and 0.01 rad in 0.2 s
-KNOWN_TO = 0.05  # m, standard deviation of the given map
-PARAMS = default_params("range_bearing")._replace(
-    sigma_range=0.1, sigma_bearing=float(np.deg2rad(1)), growth=0.0, view_range=12.0
-)
 SIZES = dict(particles=10000, landmarks=100, measurements=20)
-LOOP_PARTICLES = 4
-BLOCK = 500  # particles at once in the blocked NumPy filter: the fastest of 16 to 10,000
 LOOP = "loop baseline"
-
-
-def simulate(landmarks, measurements, steps, seed=0):
-    """Given map [M, 2], true poses [T, 3], and each frame's (range, bearing) [T, K, 2]."""
-    rng = np.random.default_rng(seed)
-    side = int(np.ceil(np.sqrt(landmarks)))
-    nodes = np.stack(np.meshgrid(np.arange(side), np.arange(side)), -1).reshape(-1, 2)[:landmarks]
-    marks = 2.0 * nodes + 1 - side + rng.uniform(-0.4, 0.4, nodes.shape)
-    pose, poses, frames = np.zeros(3), [], []
-    for _ in range(steps):
-        pose = pose + [0.1 * np.cos(pose[2]), 0.1 * np.sin(pose[2]), DRIVE.dtheta]
-        apart = marks - pose[:2]
-        apart = apart[rng.permutation(np.argsort(np.hypot(*apart.T))[:measurements])]
-        clean = np.column_stack([np.hypot(*apart.T), np.arctan2(*apart.T[::-1]) - pose[2]])
-        noise = rng.normal(0, [PARAMS.sigma_range, PARAMS.sigma_bearing], clean.shape)
-        poses.append(pose)
-        frames.append(clean + noise)
-    return marks + rng.normal(0, KNOWN_TO, marks.shape), np.array(poses), np.array(frames)
-
-
-def jax_contender(marks, config, donated):
-    """A function of a frame z [K, 2] that does one step and returns the mean pose."""
-    factor = np.array([[KNOWN_TO], [0], [KNOWN_TO]]) * np.ones(len(marks))
-    key = jax.random.key(0)
-    state = fastslam.init(config, key, landmarks_given=(marks.T, factor))
-    odometry, params = jax.tree.map(jnp.asarray, (DRIVE, Params(*map(float, PARAMS))))
-    step = fastslam.step
-    if donated:
-        step = jax.jit(step, static_argnames="config", donate_argnames="state")
-    k = config.measurements
-    rest = np.zeros((k, 3), "f"), np.full(k, -1, "i"), np.ones(k, bool), np.array(True)
-
-    def advance(z):
-        nonlocal state
-        frame = Measurements(z.astype("f"), *rest)
-        state, info = jax.block_until_ready(step(key, state, odometry, frame, params, config))
-        return info.estimate.mean
-
-    return advance, lambda: float((fastslam.settled(state).landmarks.count > 0).sum(0).mean())
-
-
-def numpy_contender(marks, config, block):
-    n, rng = config.particles, np.random.default_rng(1)
-    world = np.zeros((6, n, len(marks)), np.float32)
-    world[:2] = marks.T[:, None]
-    world[[2, 4]], world[5] = KNOWN_TO**2, PARAMS.existence_max
-    state = np.zeros((3, n), np.float32), world, np.ones((n, len(marks)), np.int32)
-
-    def advance(z):
-        nonlocal state
-        state, mean = vectorised_numpy.step(state, DRIVE, z.astype("f"), PARAMS, rng, block)
-        return mean
-
-    return advance, lambda: float((state[2] > 0).sum(1).mean())
-
-
-def loop_contender(marks, config):
-    n, rng = LOOP_PARTICLES, np.random.default_rng(2)
-    model, cov = baseline.make_model(PARAMS, config), KNOWN_TO**2 * np.eye(2)
-
-    def known(i, mark):
-        return baseline_ekf.Landmark(mark, cov, np.zeros(2), 1, PARAMS.existence_max, -4 - i)
-
-    maps = [[known(i, mark) for i, mark in enumerate(marks)] for _ in range(n)]
-    particles = [baseline.Particle(np.zeros(3), each, -np.log(n)) for each in maps]
-    index = 0
-
-    def advance(z):
-        nonlocal particles, index
-        frame = [SimpleNamespace(k=k, value=value, identity=-1) for k, value in enumerate(z)]
-        draws = rng.standard_normal((3, n)), rng.random()
-        particles, row = baseline.step(particles, DRIVE, frame, len(z), index, *draws, model)
-        index += 1
-        return row["pose_mean"]
-
-    return advance, lambda: np.mean([sum(m is not None for m in p.landmarks) for p in particles])
 
 
 def measure(given):
     """One row per contender: times, and how far its last mean pose is off the truth."""
     frames = 1 + given.rounds * given.steps
-    marks, truth, seen = simulate(given.landmarks, given.measurements, frames)
+    marks, _, truth, seen, ids = contenders.simulate(given.landmarks, given.measurements, frames)
     sizes = {name: getattr(given, name) for name in SIZES}
     config = Config(**sizes, resample_threshold=1.0)
-    contenders = {
-        "jaxslam, state donated": jax_contender(marks, config, True),
-        "jaxslam, plain call": jax_contender(marks, config, False),
-        "vectorised NumPy": numpy_contender(marks, config, given.particles),
-        "the same, in blocks": numpy_contender(marks, config, BLOCK),
-        LOOP: loop_contender(marks, config),
+    rivals = {
+        "jaxslam, state donated": contenders.of_jax(marks, config)[:2],
+        "jaxslam, plain call": contenders.of_jax(marks, config, donated=False)[:2],
+        "vectorised NumPy": contenders.of_numpy(marks, config, block=given.particles),
+        "the same, in blocks": contenders.of_numpy(marks, config),
+        LOOP: contenders.of_loop(marks, config),
     }
-    poses = {name: advance(seen[0]) for name, (advance, _) in contenders.items()}  # compiles
-    times = {name: [] for name in contenders}
+    poses = {name: advance(seen[0], ids[0]) for name, (advance, _) in rivals.items()}  # compiles
+    times = {name: [] for name in rivals}
     for round_ in range(given.rounds):
-        for name, (advance, _) in contenders.items():
+        for name, (advance, _) in rivals.items():
             for t in range(1 + round_ * given.steps, 1 + (round_ + 1) * given.steps):
                 begin, begin_cpu = time.perf_counter(), time.process_time()
-                poses[name] = advance(seen[t])
+                poses[name] = advance(seen[t], ids[t])
                 now = time.perf_counter(), time.process_time()
                 times[name].append((now[0] - begin, now[1] - begin_cpu))
     rows = []
-    for name, (_, occupied) in contenders.items():
+    for name, (_, occupied) in rivals.items():
         wall, cpu = 1e3 * np.array(times[name]).T
-        particles = LOOP_PARTICLES if name == LOOP else given.particles
+        particles = contenders.LOOP_PARTICLES if name == LOOP else given.particles
         apart = np.asarray(poses[name], float) - truth[-1]
         rows.append(
             dict(name=name, particles=particles, steps=len(wall), min_ms=wall.min(),

@@ -1,9 +1,10 @@
-"""FastSLAM 1.0 in vectorised NumPy, float32: a contender of step_time.py, which runs it.
+"""FastSLAM 1.0 in vectorised NumPy, float32: a contender of step_time.py and scaling.py.
 
 The filter's rules for `range_bearing` with unknown identities, clutter, exclusive matching and
-existence, written from their description over arrays [particles, landmarks]; gains 1, no mounting,
-no growth, resampling every step. A state is poses [3, N], the map [6, N, M] (x, y, xx, xy, yy,
-log-odds) and the times seen [N, M]. Numbers are Python floats: NumPy's own would make it float64.
+existence, or with known ones and clutter, written from their description over arrays [particles,
+landmarks]; gains 1, no mounting, no growth, resampling every step. A state is poses [3, N], the map
+[6, N, M] (x, y, xx, xy, yy, log-odds; known: without these) and the times seen [N, M]. Numbers are
+Python floats: NumPy's own would make it float64.
 """
 
 import math
@@ -11,20 +12,31 @@ import math
 import numpy as np
 
 
-def step(state, odometry, z, p, rng, block):
-    """One step with measurements z [K, 2], `block` particles at a time: state and mean pose [3]."""
+def step(state, odometry, z, p, rng, block, ids=None):
+    """One step with measurements z [K, 2], `block` particles at a time: state and mean pose [3].
+
+    `ids` [K]: the landmarks measured, where that is known.
+    """
     pose, world, count = state
     pose, n = move(pose, odometry, p, rng), pose.shape[1]
-    parts = [slice(i, i + block) for i in range(0, n, block)]
-    density = np.concatenate([observe(pose[:, i], world[:, i], count[i], z, p) for i in parts])
+    density = []
+    for i in (slice(i, i + block) for i in range(0, n, block)):
+        part = pose[:, i], world[:, i], count[i]
+        density.append(observe(*part, z, p) if ids is None else named(*part, z, ids, p))
+    ancestors, mean = drawn(pose, np.concatenate(density), rng)
+    return (pose[:, ancestors], world[:, ancestors], count[ancestors]), mean
+
+
+def drawn(pose, density, rng):
+    """Ancestors [N] by systematic resampling, and the weighted mean pose [3] before it."""
+    n = len(density)
     weight = np.exp(density - density.max())
     weight /= weight.sum()
     heading = np.arctan2(weight @ np.sin(pose[2]), weight @ np.cos(pose[2]))
     mean = np.array([weight @ pose[0], weight @ pose[1], heading])
     total = np.cumsum(weight, dtype=float)
     at = (np.arange(n) + rng.random()) / n * total[-1]
-    ancestors = np.minimum(np.searchsorted(total, at, side="right"), n - 1)
-    return (pose[:, ancestors], world[:, ancestors], count[ancestors]), mean
+    return np.minimum(np.searchsorted(total, at, side="right"), n - 1), mean
 
 
 def wrap(angle):
@@ -112,30 +124,49 @@ def associate(table, threshold):
 
 def update(pose, world, count, matched, slot, z, p):
     """EKF updates in the measurements' order, on the matched landmarks only: log densities [n]."""
-    x, y, xx, xy, yy = world[:5]
-    density, constant = np.zeros(len(slot), np.float32), math.log1p(-p.outlier)
-    constant -= math.log(2 * math.pi)
+    density = np.zeros(len(slot), np.float32)
     for k in range(len(z)):
         i = np.flatnonzero(slot[:, k] >= 0)
         at = i, slot[i, k]
-        vx, vxy, vy = xx[at], xy[at], yy[at]
-        old = x[at], y[at], vx, vxy, vy
-        r, bearing, (a, b, c, d), (s00, s01, s11) = predict(*old, pose[:, i], p)
-        det = s00 * s11 - s01 * s01
-        e0, e1 = z[k, 0] - r, wrap(z[k, 1] - bearing)
-        square = (s11 * e0 * e0 - 2 * s01 * e0 * e1 + s00 * e1 * e1) / det
-        density[i] += constant - 0.5 * (square + np.log(det))
-        px0, py0, px1, py1 = vx * a + vxy * b, vxy * a + vy * b, vx * c + vxy * d, vxy * c + vy * d
-        gx0, gx1 = (px0 * s11 - px1 * s01) / det, (px1 * s00 - px0 * s01) / det
-        gy0, gy1 = (py0 * s11 - py1 * s01) / det, (py1 * s00 - py0 * s01) / det
-        x[at] += gx0 * e0 + gx1 * e1
-        y[at] += gy0 * e0 + gy1 * e1
-        xx[at] = vx - gx0 * px0 - gx1 * px1
-        xy[at] = vxy - gx0 * py0 - gx1 * py1
-        yy[at] = vy - gy0 * py0 - gy1 * py1
+        new, log_density = corrected([part[at] for part in world[:5]], pose[:, i], z[k], p)
+        for part, value in zip(world, new, strict=False):
+            part[at] = value
+        density[i] += log_density
         count[at] += 1
         matched[at] = True
     return density
+
+
+def named(pose, world, count, z, ids, p):
+    """Log densities [n] with measurement k of landmark ids[k], no two of the same: all at once."""
+    old = world[:, :, ids]
+    new, density = corrected(old, pose[:, :, None], z.T, p)
+    clutter = math.log(p.outlier / ((p.view_max - p.view_min) * p.view_range))
+    good = density >= clutter
+    world[:, :, ids] = np.where(good, np.stack(new), old)
+    count[:, ids] += good
+    return np.maximum(density, clutter).sum(1)
+
+
+def corrected(old, pose, z, p):
+    """Landmarks (x, y, xx, xy, yy) after measurements z (range, bearing), and log densities."""
+    x, y, vx, vxy, vy = old
+    r, bearing, (a, b, c, d), (s00, s01, s11) = predict(*old, pose, p)
+    det = s00 * s11 - s01 * s01
+    e0, e1 = z[0] - r, wrap(z[1] - bearing)
+    square = (s11 * e0 * e0 - 2 * s01 * e0 * e1 + s00 * e1 * e1) / det
+    px0, py0, px1, py1 = vx * a + vxy * b, vxy * a + vy * b, vx * c + vxy * d, vxy * c + vy * d
+    gx0, gx1 = (px0 * s11 - px1 * s01) / det, (px1 * s00 - px0 * s01) / det
+    gy0, gy1 = (py0 * s11 - py1 * s01) / det, (py1 * s00 - py0 * s01) / det
+    new = (
+        x + gx0 * e0 + gx1 * e1,
+        y + gy0 * e0 + gy1 * e1,
+        vx - gx0 * px0 - gx1 * px1,
+        vxy - gx0 * py0 - gx1 * py1,
+        vy - gy0 * py0 - gy1 * py1,
+    )
+    inlier = math.log1p(-p.outlier) - math.log(2 * math.pi)
+    return new, inlier - 0.5 * (square + np.log(det))
 
 
 def create(pose, world, count, z, p):

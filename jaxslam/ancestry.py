@@ -8,12 +8,17 @@ belongs to particle i now. There are few chains; when a new one is needed and al
 slots of the oldest are brought up to date.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from jaxslam import devices
+from jaxslam.listing import rounds
+
 CURRENT = -1
+TOGETHER = 2**18  # particles of all rows in one message
 
 
 class Ancestry(NamedTuple):
@@ -37,26 +42,32 @@ def new(config):
     )
 
 
-def update(world, ancestry, wanted):
+def update(world, ancestry, wanted, config):
     """The map with the slots `wanted` [M] (or all: True) brought up to date.
 
     In place, row by row: a `take` of the whole map would need a second copy of it.
     """
     behind = (ancestry.chain != CURRENT) & wanted
-    slots = jnp.nonzero(behind, size=len(behind), fill_value=0)[0]
+    slots, count = jnp.nonzero(behind, size=len(behind), fill_value=0)[0], behind.sum()
+    # Rows travel between devices some at a time.
+    some = 1 if config.devices == 1 else max(1, min(8, TOGETHER // config.particles))
 
-    def one(i, leaves):
-        slot = slots[i]
-        index = jax.lax.dynamic_index_in_dim(ancestry.chains, ancestry.chain[slot], keepdims=False)
+    def row(leaf, slot):
+        return jax.lax.dynamic_index_in_dim(leaf, slot, leaf.ndim - 2, keepdims=False)
 
-        def row(leaf):
-            old = jax.lax.dynamic_index_in_dim(leaf, slot, leaf.ndim - 2, keepdims=False)
-            fresh = old.at[..., index].get(mode="promise_in_bounds")
-            return jax.lax.dynamic_update_index_in_dim(leaf, fresh, slot, leaf.ndim - 2)
+    def put(leaf, new, slot):
+        return jax.lax.dynamic_update_index_in_dim(leaf, new, slot, leaf.ndim - 2)
 
-        return jax.tree.map(row, leaves)
+    def update_some(i, leaves):
+        # Beyond the last comes the last again, which does no harm: all are read before any is put.
+        at = [slots[jnp.minimum(i * some + j, count - 1)] for j in range(some)]
+        rows = [jax.tree.map(partial(row, slot=slot), leaves) for slot in at]
+        indices = devices.mine([row(ancestry.chains, ancestry.chain[s]) for s in at], config)
+        for slot, new in zip(at, devices.taken(rows, indices, config), strict=True):
+            leaves = jax.tree.map(partial(put, slot=slot), leaves, new)
+        return leaves
 
-    leaves = jax.lax.fori_loop(0, behind.sum(), one, world)
+    leaves = rounds(-(-count // some), update_some, world)
     chain = jnp.where(behind, CURRENT, ancestry.chain)
     return leaves, ancestry._replace(chain=chain)
 

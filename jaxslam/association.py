@@ -11,7 +11,7 @@ from jax.lax import stop_gradient
 
 from jaxslam.geometry import wrap
 from jaxslam.landmarks import score
-from jaxslam.listing import listed
+from jaxslam.listing import added, listed
 
 NEW, CLUTTER, PADDING = -1, -2, -3
 
@@ -60,7 +60,7 @@ def _sampled(config, scorer, measurements, new, clutter, params, picks):
         table = jnp.where(taken, -jnp.inf, table)
         top = jnp.maximum(table.max(0), jnp.maximum(new[k], clutter))
         share, other = jnp.exp(table - top), jnp.exp(new[k] - top)
-        total = share.sum(0) + other + jnp.exp(clutter - top)
+        total = added(share) + other + jnp.exp(clutter - top)
         mark = picks[k] * total
 
         # The slot in which the running sum passes the mark; "new" and "clutter" come after all.
@@ -91,21 +91,37 @@ def _sampled(config, scorer, measurements, new, clutter, params, picks):
 def _known(config, scorer, measurements, clutter, params, picks=None):
     """Identity i is slot i; an occupied slot that fits worse than clutter does is not taken, or,
     with `picks`, taken with its share of the two. Also the log probability [n] of such draws."""
-    slots, lanes = scorer.constant.shape
+    slots = len(scorer.constant)
     slot = jnp.clip(measurements.identity, 0, slots - 1)
     rows = jax.tree.map(lambda leaf: leaf[slot], scorer)
-    density = score(config.sensor, rows, *_columns(measurements), params)
-    occupied = rows.constant > -jnp.inf
-    slot = jnp.broadcast_to(slot[:, None], (len(slot), lanes))
-    log_choice = jnp.zeros_like(rows.constant[0])
-    taken = density >= clutter
-    if picks is not None:
+    density = score(config.sensor, rows, *columns(measurements), params)
+    there = measurements.valid & (measurements.identity < slots)
+    return _decided(slot, there, rows.constant > -jnp.inf, density, clutter, picks)
+
+
+def named(rows, occupied, density, measurements, clutter, picks=None):
+    """`associate` where measurement k can be of one slot alone: that of `rows` (`matched.Rows`),
+    `occupied` [K, n] or not, under which it has the log density [K, n]."""
+    density, clutter = stop_gradient((density, clutter))
+    slot, log_choice = _decided(rows.slot, rows.there, occupied, density, clutter, picks)
+    return jnp.where(measurements.valid[:, None], slot, PADDING), log_choice
+
+
+def _decided(slot, there, occupied, density, clutter, picks):
+    """What `_known` says, of slots [K] that are `there` [K] and of densities [K, n]."""
+    log_choice = jnp.zeros_like(density[0])
+    if picks is None:
+        # A branch hands on arrays: else XLA works densities out again for all that depends on it.
+        taken = jax.lax.cond(
+            clutter > -jnp.inf, lambda d: d >= clutter, lambda d: ~jnp.isnan(d), density
+        )
+    else:
         taken = picks < jax.nn.sigmoid(density - clutter)
         chosen = jax.nn.log_sigmoid(jnp.where(taken, density - clutter, clutter - density))
-        drawn = occupied & (measurements.valid & (measurements.identity < slots))[:, None]
-        log_choice = jnp.where(drawn & (clutter > -jnp.inf), chosen, 0.0).sum(0)
-    slot = jnp.where(occupied, jnp.where(taken, slot, CLUTTER), NEW)
-    return jnp.where((measurements.identity < slots)[:, None], slot, NEW), log_choice
+        drawn = occupied & there[:, None] & (clutter > -jnp.inf)
+        log_choice = added(jnp.where(drawn, chosen, 0.0))
+    slot = jnp.where(occupied, jnp.where(taken, slot[:, None], CLUTTER), NEW)
+    return jnp.where(there[:, None], slot, NEW), log_choice
 
 
 def _maximum_likelihood(config, scorer, measurements, threshold, params):
@@ -223,7 +239,7 @@ def _settle(config, scorer, measurements, threshold, params, best, possible):
     return settled[0][1]
 
 
-def _columns(measurements):
+def columns(measurements):
     """Value and covariance as tuples of [K, 1] columns, to broadcast over particles."""
     value = tuple(measurements.value[:, i, None] for i in range(2))
     cov = tuple(measurements.cov[:, i, None] for i in range(3))

@@ -1,10 +1,13 @@
 """Files and folders that appear whole or not at all."""
 
+import errno
 import os
 import shutil
 from contextlib import contextmanager
 from pathlib import Path
 from secrets import token_hex
+
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 
 
 @contextmanager
@@ -12,7 +15,7 @@ def replacing(path):
     """A binary file that becomes `path` once it is written and on the disk.
 
     Whatever goes wrong, the old file stays and nothing is left beside it. Raises `ValueError` where
-    the place can't be written.
+    the place can't be written, `OSError` where there is no space.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -23,6 +26,8 @@ def replacing(path):
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as err:
+        if err.errno in NO_SPACE:
+            raise OSError(err.errno, err.strerror, str(path)) from err
         raise ValueError(f"{path}: cannot write ({err.strerror}); choose another place") from err
     finally:
         temporary.unlink(missing_ok=True)

@@ -123,6 +123,9 @@ def alternatives(measurement, model):
         area, volume = 1.0, width * reach**2 / 2
     else:
         area, volume = reach**2 / 2, width
+        if model.association == "maximum_likelihood":
+            # A bearing has no place: at most one new landmark a frame is expected.
+            area = min(area, 1 / (width * model.density_new))
     new = np.log(1 - model.outlier) + np.log(model.density_new * area)
     return new, np.log(model.outlier) - np.log(volume) if model.clutter else -np.inf
 

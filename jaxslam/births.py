@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxslam import sensors
 from jaxslam.association import NEW
 from jaxslam.landmarks import Landmarks
-from jaxslam.listing import listed
+from jaxslam.listing import listed, pinned
 
 AT_ONCE = 16
 
@@ -29,19 +29,17 @@ def create(config, world, start, sensor_pose, match, free, measurements, params,
     serves all of `AT_ONCE` particles.
     """
     total, slots, width = len(match), world.count.shape[0], match.shape[1]
-    new = match == NEW
-    nth = jnp.tril(jnp.ones((total, total), jnp.float32)) @ new.astype(jnp.float32)
-    nth = nth.astype(jnp.int32)
-    if config.association == "known":
-        slot = jnp.where(measurements.identity >= 0, measurements.identity, slots)
-        taken = jnp.where(new.any(1), slot, slots)
-        slot = slot[:, None]
-    else:
-        taken = jnp.where(jnp.arange(total) < nth[-1].max(), free, slots)
-        slot = free[jnp.maximum(nth - 1, 0)]
-    slot = jnp.where(new, slot, slots).astype(jnp.int32)
-    lanes, count = listed(nth[-1] > 0)
-    lanes = jnp.pad(lanes, (0, AT_ONCE), constant_values=width)
+    slot, lanes, count, touched, lost = jax.lax.cond(
+        (match == NEW).any(),
+        lambda *given: _planned(config, slots, *given),
+        lambda *given: jax.tree.map(
+            lambda part: jnp.zeros(part.shape, part.dtype),
+            jax.eval_shape(lambda *given: _planned(config, slots, *given), *given),
+        ),
+        match,
+        free,
+        measurements.identity,
+    )
     value, cov = (tuple(part.T[:, :, None]) for part in map(jnp.asarray, measurements[:2]))
     forgetting = world.log_odds is not None
     odds = jnp.minimum(params.existence_new, params.existence_max)
@@ -52,7 +50,8 @@ def create(config, world, start, sensor_pose, match, free, measurements, params,
         lane = jax.lax.dynamic_slice_in_dim(lanes, i * AT_ONCE, AT_ONCE)
         there, lane = lane < width, jnp.minimum(lane, width - 1)
         to = jnp.where(there, slot[:, lane], slots)  # beyond: dropped
-        here = tuple(part[lane] for part in sensor_pose)
+        # Arrays of their own: fused, what rounds them would depend on the shape of the block.
+        here = pinned(tuple(part[lane] for part in sensor_pose))
         mean, factor, anchor = sensors.locate(config.sensor, here, value, cov, params)
 
         def whole(parts):
@@ -74,8 +73,30 @@ def create(config, world, start, sensor_pose, match, free, measurements, params,
         return i + 1, jax.tree.map(put, world, fresh)
 
     _, world = jax.lax.while_loop(lambda carry: carry[0] * AT_ONCE < count, some, (0, world))
+    return world, touched, lost
+
+
+def _planned(config, slots, match, free, identity):
+    """Where births go: slots [K, n]; the particles that have any, listed, and how many; slots [M]
+    in which there is one; and how many find none [n]."""
+    new = match == NEW
+    if config.association == "known":
+        some = new.any(0)
+        slot = jnp.where(identity >= 0, identity, slots)
+        taken = jnp.where(new.any(1), slot, slots)
+        slot = slot[:, None]
+    else:
+        total = len(match)
+        nth = jnp.tril(jnp.ones((total, total), jnp.float32)) @ new.astype(jnp.float32)
+        nth = nth.astype(jnp.int32)
+        some = nth[-1] > 0
+        taken = jnp.where(jnp.arange(total) < nth[-1].max(), free, slots)
+        slot = free[jnp.maximum(nth - 1, 0)]
+    slot = jnp.where(new, slot, slots).astype(jnp.int32)
+    lanes, count = listed(some)
+    lanes = jnp.pad(lanes, (0, AT_ONCE), constant_values=match.shape[1])
     touched = (taken[:, None] == jnp.arange(slots)).any(0)
-    return world, touched, (new & (slot >= slots)).sum(0).astype(jnp.int32)
+    return slot, lanes, count, touched, (new & (slot >= slots)).sum(0).astype(jnp.int32)
 
 
 def given(world, known):

@@ -26,6 +26,7 @@ ITERATIONS = 60
 # under a wide kernel, which only leads there.
 CLOSE, CLOSE_WIDE = 1e-8, 1e-2
 MOST_DAMPING = 1e8
+DAMPINGS = (0.0, 1e-9, 1e-6, 1e-3, 1.0)
 
 
 class Problem(NamedTuple):
@@ -93,6 +94,14 @@ def problem(frames, start_pose, start_cov, params, sensor):
     ), place
 
 
+def until(given, place, done):
+    """The problem of the first `done` intervals, and where its measurements stand."""
+    count = np.searchsorted(given.frame, done)
+    part = {name: getattr(given, name)[:count] for name in ("frame", "value", "cov", "share")}
+    odometry = Odometry(*(leaf[:done] for leaf in given.odometry))
+    return given._replace(odometry=odometry, **part), place[:count]
+
+
 def fit(given, path, points, which, widths, progress=None):
     """`Fit` of the path and of points [L, 2], from a start; `which` [M]: point measured, or -1.
 
@@ -106,13 +115,13 @@ def fit(given, path, points, which, widths, progress=None):
     linear = _linearise(given, path, points, which)
     inlier, cost = _weigh(given, linear, which, 1.0)
     weight = inlier * given.share
-    normal = _assemble(given, linear, weight, which, len(points), 0.0)
+    normal, factor = _taken_apart(given, linear, weight, which, len(points))
     sure = inlier > 0.5
     square = linear.seen[0][sure] ** 2
     return Fit(
         path=path,
         points=points,
-        factor=chain.solve(normal)[2],
+        factor=factor,
         weight=inlier,
         information=normal.corner,
         residual=float(np.sqrt(square.mean())) if sure.any() else 0.0,
@@ -122,13 +131,28 @@ def fit(given, path, points, which, widths, progress=None):
     )
 
 
+def _taken_apart(given, linear, weight, which, size):
+    """The normal matrix and its `chain.Factor`.
+
+    A point that ran off to where nothing holds it makes the matrix singular to rounding: then it is
+    damped, by as little as will do. Such a point has no depth and leaves the map.
+    """
+    for damping in DAMPINGS:
+        normal = _assemble(given, linear, weight, which, size, damping)
+        try:
+            return normal, chain.solve(normal)[2]
+        except np.linalg.LinAlgError:
+            if damping == DAMPINGS[-1]:
+                raise
+
+
 def log_inlier(given, path, point):
     """log density [M] of all measurements, were they of `point` [2]: that of an inlier."""
     pose = path[given.frame + 1]
     point = np.broadcast_to(point, (len(pose), 2))
-    scale = np.asarray(residuals.scales(given.sensor, pose, point, given.cov, given.params))
+    scale = residuals.scales(given.sensor, pose, point, given.cov, given.params)
     rest = residuals.innovations(given.sensor, pose, point, given.value, scale, given.params)
-    return _log_density(given, np.asarray(rest), scale)
+    return _log_density(given, rest, scale)
 
 
 def sensor_poses(path, params):
@@ -193,13 +217,13 @@ class _Linear(NamedTuple):
 
 def _linearise(given, path, points, which):
     pose, point = path[given.frame + 1], _gather(points, which)
-    scales = np.asarray(residuals.scales(given.sensor, pose, point, given.cov, given.params))
+    scales = residuals.scales(given.sensor, pose, point, given.cov, given.params)
     moved = residuals.motion_jacobian(path[:-1], path[1:], given.odometry, given.params)
     seen = residuals.jacobian(given.sensor, pose, point, given.value, scales, given.params)
     return _Linear(
         start=(_start(given, path), given.root),
-        moved=jax.tree.map(np.asarray, moved),
-        seen=jax.tree.map(np.asarray, seen),
+        moved=moved,
+        seen=seen,
         scales=scales,
     )
 
@@ -218,7 +242,7 @@ def _start(given, path):
 def _log_density(given, rest, scale, width=1.0):
     """log of (1 - outlier) x normal [M] of whitened residuals [M, m], `width` times as wide."""
     m = rest.shape[1]
-    normaliser = np.sum(np.log(scale[:m]), 0) - m * (np.log(width) + sensors.LOG_2PI / 2)
+    normaliser = np.sum(np.log(scale[:, :m]), 1) - m * (np.log(width) + sensors.LOG_2PI / 2)
     square = np.sum(rest**2, 1) / width**2
     return np.log1p(-given.params.outlier) + normaliser - square / 2
 
@@ -248,8 +272,8 @@ def _cost(given, path, points, which, linear, width):
     rest = residuals.innovations(
         given.sensor, pose, point, given.value, linear.scales, given.params
     )
-    _, cost = _mixture(given, np.asarray(rest), linear.scales, which, width)
-    moved = np.asarray(residuals.motions(path[:-1], path[1:], given.odometry, given.params))
+    _, cost = _mixture(given, rest, linear.scales, which, width)
+    moved = residuals.motions(path[:-1], path[1:], given.odometry, given.params)
     return float(cost + (np.sum(_start(given, path) ** 2) + np.sum(moved**2)) / 2)
 
 

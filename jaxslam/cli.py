@@ -1,8 +1,9 @@
 """The command line: one small function per command.
 
 Results go to stdout, progress and warnings to stderr. Exit codes: 0 ok; 1 finished with warnings
-(data lost, map full, numbers not finite); 2 bad input or usage; 130 interrupted. Everything heavy
-is imported where it is needed, so that `--help` comes at once.
+(data lost, map full, numbers not finite); 2 bad input or usage; 69 a process of the run is missing
+or died; 74 no space left; 75 the run's folder is being written by another process; 130 interrupted.
+Everything heavy is imported where it is needed, so that `--help` comes at once.
 """
 
 import os
@@ -12,7 +13,8 @@ from typing import Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
-from jaxslam import cli_images, cli_learn
+from jaxslam import cli_images, cli_learn, cli_run, hosts, watched
+from jaxslam.atomic import NO_SPACE
 from jaxslam.config import ASSOCIATIONS, PROPOSALS
 from jaxslam.console import (
     DEMO,
@@ -24,7 +26,6 @@ from jaxslam.console import (
     Start,
     bar,
     check_new,
-    note,
     option,
     warn,
     whole,
@@ -36,7 +37,11 @@ Begin with:  jaxslam demo     (a real robot's run becomes a map, in runs/demo)
 Then:        jaxslam run {DEMO} --sensor bearing --association known
 LOG is a .npz file, or {DEMO}, a log that comes with the program.
 Each command has a --help of its own, with an example.
-Exit codes: 0 ok, 1 ended with warnings, 2 bad input or usage, 130 interrupted."""
+Exit codes: 0 ok, 1 ended with warnings, 2 bad input or usage, 69 a process of the run is
+missing or died, 74 no space left, 75 folder in use, 130 interrupted."""
+
+FULL, BUSY = 74, 75  # no space left; the folder is in use
+HOST_PORT = "HOST:PORT where process 0 waits for the others (127.0.0.1: of this machine)"
 
 app = App(
     name="jaxslam",
@@ -63,18 +68,19 @@ ASSOCIATED = "find out which landmark was measured, believe the log, or draw by 
 Association = option(Literal[ASSOCIATIONS], ASSOCIATED)
 Plain = Literal["maximum_likelihood", "known"]
 PROPOSED = "poses drawn from odometry, or informed by the measurements"
+REJUVENATED = "metres after which particles are redrawn (bearings, hidden: 3; else 0: never)"
 Proposal = option(Literal[PROPOSALS], PROPOSED) | None
 
 
 @app.command
 def demo(*, seed: Seed = 0):
-    """Map a real room: the bundled log, ranges and bearings, identities hidden.
+    """Map a real room: the bundled log, bearings alone, identities hidden.
 
-    1,000 particles, about a minute; writes runs/demo, replacing an earlier demo.
+    1,000 particles, two or three minutes; writes runs/demo, replacing an earlier demo.
 
     Example: jaxslam demo
     """
-    return run(DEMO, sensor="range_bearing", seed=seed, out=Path("runs/demo"), overwrite=True)
+    return run(DEMO, sensor="bearing", seed=seed, out=Path("runs/demo"), overwrite=True)
 
 
 @app.command
@@ -89,12 +95,21 @@ def run(
     landmarks: whole("slots of the map (64; known: one each)") | None = None,
     params: ParamFile = None,
     paper: Paper = False,
+    rejuvenate: option(float, REJUVENATED) | None = None,
     start: Start = 0.0,
     end: End = None,
     no_refine: option(bool, "only filter: path and map are not refined afterwards") = False,
     seed: Seed = 0,
     out: option(Path, "folder to write (runs/LOG-SENSOR-SEED)") | None = None,
     overwrite: Overwrite = False,
+    checkpoint_every: option(str, "put the run aside so often, like 60s, 5m, 1h") | None = None,
+    resume: option(bool, "go on with a run that was interrupted or killed (every 60s)") = False,
+    seeds: option(str, "several runs in one program, like 0-9 or 1,4,7-9: a table") | None = None,
+    sweep: option(tuple[str, ...], "and for these values, like err_rot=0.05,0.1 (repeat)") = (),
+    devices: whole("of this process, that share the particles (or the runs of --seeds)") = 1,
+    coordinator: option(str, HOST_PORT) | None = None,
+    num_processes: whole("processes that share the run (Slurm, Open MPI say)") | None = None,
+    process_id: whole("which of them this is; 0 alone writes and speaks", 0) | None = None,
 ):
     """Filter a log, then refine: trajectory, map, figures and errors in a folder.
 
@@ -102,44 +117,39 @@ def run(
     trajectory_refined.tum and landmarks_refined.csv are the best particle's past
     and map improved by least squares. The folder also holds map.png, error.png,
     particles.png, summary.json, run.toml (every setting), events.jsonl, steps.npz.
+    With --seeds or --sweep: runs.csv, and a folder for each run, without figures.
 
     Example: jaxslam run lost-in-the-woods --particles 2000 --out runs/woods
     """
-    with bar("reading"):
-        from jaxslam import report, runner
+    place = hosts.place(coordinator, num_processes, process_id)
+    if place and place.process:
+        watched.go_on_watched()
+    with bar("reading", shown=place is None or place.process == 0):
         from jaxslam.log import load_log
         from jaxslam.parts import cut
 
         loaded, part = load_log(log), bool(start) or end is not None
         loaded = cut(loaded, start, end) if part else loaded
-    model = _model(loaded, sensor, association, particles, landmarks, params, paper, proposal)
-    out = out or Path("runs") / f"{Path(log).stem}-{model[0].sensor}-{seed}"
-    report.check_target(out, overwrite)
-    with bar("filtering", compiles=True) as progress:
-        result = runner.run(loaded, *model, seed, progress, refine=False)
-    if not no_refine:
-        with bar("refining") as progress:
-            result = runner.refined(result, progress)
-    with bar("writing"):
-        report.save(result, out, overwrite, log_source=None if part else log)
-    _told(result, out)
-    return int(bool(result.flags))
-
-
-def _told(result, out):
-    """Print what a run found, its advice and its warnings."""
-    from jaxslam import report
-    from jaxslam.error_table import error_table
-
-    print(error_table(report.summarise(result)))
-    spent = f"{result.seconds:.1f} s, and {result.compile_seconds:.1f} s to compile"
-    if result.refined is not None:
-        spent += f"; refined in {result.refine_seconds:.1f} s"
-    print(f"{len(result.time)} steps in {spent}\n{out}: the map is {out / 'map.png'}")
-    for line in result.advice:
-        note(line)
-    for line in result.flags:
-        warn(line)
+    many = seeds is not None or sweep
+    if many and (checkpoint_every or resume or place):
+        raise ValueError("--seeds and --sweep are for small runs: without checkpoints, one process")
+    total = 1 if many else devices * (place.processes if place else 1)
+    model = cli_run.model(
+        loaded, sensor, association, particles, landmarks, params, paper, proposal, total,
+        rejuvenate,
+    )  # fmt: skip
+    name = seed if seeds is None else f"seeds-{seeds}"
+    out = out or Path("runs") / f"{Path(log).stem}-{model[0].sensor}-{name}"
+    cli_run.use_devices(devices)
+    long = cli_run.Long(checkpoint_every or "60s", resume) if checkpoint_every or resume else None
+    task = cli_run.Task(
+        loaded, *model, seed, out, log, part, overwrite, no_refine, long, shared=place is not None
+    )
+    if many:
+        return cli_run.run_many(task, str(seed) if seeds is None else seeds, sweep, devices)
+    if place is None:
+        return cli_run.run(task)
+    return cli_run.run_shared(task, place, guarded)
 
 
 @app.command
@@ -175,7 +185,7 @@ def compare(
         loaded = load_log(log)
     rows = []
     for count in counts:
-        model = _model(loaded, sensor, association, count, None, params, paper)
+        model = cli_run.model(loaded, sensor, association, count, None, params, paper)
         with bar(f"{count} particles", compiles=True) as progress:
             rows.append(sides.compare(loaded, *model, seed, steps, every, progress))
     print(sides.table(rows))
@@ -183,7 +193,7 @@ def compare(
         from jaxslam import variants as rules
 
         with bar("variants", compiles=True) as progress:
-            model = _model(loaded, sensor, association, variants, None, params, paper)
+            model = cli_run.model(loaded, sensor, association, variants, None, params, paper)
             found = rules.variants(loaded, *model, seed, steps, every, rows, progress)
         print(f"\n{rules.table(found)}")
     parted = [row.double for row in rows if row.double.same < row.double.steps]
@@ -314,22 +324,32 @@ def planar(
 
 def main(argv=None):
     """Run one command (None: the process's arguments); returns the exit code."""
+    tokens = sys.argv[1:] if argv is None else argv
+    told = {"exit_on_error": False, "print_error": False, "result_action": "return_value"}
+    return guarded(lambda: app(tokens, **told), at_once=argv is None)
+
+
+def guarded(work, at_once=False):
+    """The exit code of some work, after the one line that says what went wrong."""
+    failed = 2
     try:
-        tokens = sys.argv[1:] if argv is None else argv
-        code = app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
+        code = work()
         sys.stdout.flush()
         return code or 0
     except CycloptsError as error:
         problem = f"{error} See: jaxslam --help"
-    except KeyboardInterrupt:
-        print("jaxslam: interrupted", file=sys.stderr, flush=True)
-        if argv is None:  # at once: stopped while compiling, JAX would crash as Python winds down
+    except KeyboardInterrupt as error:
+        print("jaxslam: interrupted" + "".join(error.args), file=sys.stderr, flush=True)
+        if at_once:  # stopped while compiling, JAX would crash as Python winds down
             os._exit(130)
         return 130
     except BrokenPipeError:  # whoever read the output has gone, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
+        failed = BUSY if isinstance(error, BlockingIOError) else failed
+        failed = FULL if error.errno in NO_SPACE else failed
+        failed = hosts.LOST if isinstance(error, ConnectionError) else failed
         problem = f"{error.filename}: {error.strerror}" if error.filename else str(error)
     except ValueError as error:
         problem = str(error)
@@ -338,24 +358,7 @@ def main(argv=None):
             raise  # a fault of ours: show where
         problem = "not enough memory; ask for fewer --particles or --landmarks"
     print("jaxslam:", problem.split("\n")[0], file=sys.stderr)
-    return 2
-
-
-def _model(log, sensor, association, particles, landmarks, params, paper, proposal=None):
-    """`Config` and `Params` as the options say."""
-    from jaxslam.config import Config, default_params
-    from jaxslam.paramfile import load_params
-    from jaxslam.runner import config_for
-
-    told = {"particles": particles, "landmarks": landmarks, "proposal": proposal}
-    told = {name: value for name, value in told.items() if value}
-    config = config_for(log, sensor or ("position" if paper else None), association, **told)
-    if paper:
-        sizes = config.particles, config.landmarks, config.measurements
-        rules = {"sensor": config.sensor, "association": association}
-        config = Config.paper(*sizes, **rules | ({"proposal": proposal} if proposal else {}))
-    base = default_params(config.sensor, log)
-    return config, load_params(params, base) if params else base
+    return failed
 
 
 def _counts(text):

@@ -75,7 +75,7 @@ def compare(log, config, params=None, seed=0, steps=200, every=None, progress=No
     `agreement`, which is run in float64 and in float32. The baseline has no other proposal than
     the prior, so both use that.
     """
-    config = dataclasses.replace(config, proposal="prior")
+    config = dataclasses.replace(config, proposal="prior", rejuvenate=0.0)
     log = select(log, thinned(log, steps, every))
     double = agreement(log, config, params, seed, steps, True, progress)
     single = agreement(log, config, params, seed, steps, False, progress)
@@ -226,7 +226,7 @@ def _run_filter(data, config, params, seed, start, log):
     jax.block_until_ready(steps(key, state, *given))  # to warm up
     begin, compiled = time.perf_counter(), compiled - begin
     final, trace = jax.block_until_ready(steps(key, state, *given))
-    final = fastslam.settled(final)
+    final = fastslam.settled(final, config)
     ran = time.perf_counter() - begin
     numbers = jnp.arange(len(data.time), dtype=jnp.int32)
     chance = jax.vmap(lambda step: fastslam.draws(key, step, config))(numbers)

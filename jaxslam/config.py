@@ -11,6 +11,7 @@ from typing import NamedTuple
 SENSORS = ("position", "range_bearing", "bearing")
 ASSOCIATIONS = ("maximum_likelihood", "known", "sampled")
 PROPOSALS = ("prior", "informed")
+REJUVENATE = 3.0  # m
 
 
 @dataclass(frozen=True)
@@ -26,8 +27,10 @@ class Config:
     beforehand to be the one measured, so that a match counts 1 / n; without it a landmark held
     twice would be twice as likely (`sampled` only). `block`: particles worked on at once, so that
     temporaries stay in cache; `lazy`: landmarks are copied to a particle's descendants when next
-    looked at, with at most `chains` ancestries to keep; of these only `block` makes a difference to
-    the result, that of rounding.
+    looked at, with at most `chains` ancestries to keep; `devices`: how many share the particles,
+    evenly. None of these four makes a difference to the result. `rejuvenate`: metres of driving
+    after which a run's particles are redrawn from their refined past (`rejuvenation`; 0: never;
+    None: 3 for bearings whose identities are hidden, else never).
 
     Raises `ValueError` for a value that is not allowed.
     """
@@ -46,6 +49,8 @@ class Config:
     block: int = 512
     lazy: bool = True
     chains: int = 16
+    devices: int = 1
+    rejuvenate: float | None = None
 
     def __post_init__(self):
         for name, allowed in (
@@ -56,13 +61,29 @@ class Config:
             value = getattr(self, name)
             if value not in allowed:
                 raise ValueError(f"Config.{name}: {value!r} is not one of {', '.join(allowed)}")
-        for name in ("particles", "landmarks", "measurements", "block", "chains"):
+        for name in ("particles", "landmarks", "measurements", "block", "chains", "devices"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"Config.{name}: {value!r} is not a whole number of at least 1")
+        if self.particles % self.devices:
+            even = self.particles // self.devices * self.devices
+            raise ValueError(
+                f"Config.devices: {self.particles} particles are not shared evenly by "
+                f"{self.devices}; {even or self.devices} or {even + self.devices} are"
+            )
         threshold = self.resample_threshold
         if not isinstance(threshold, (int, float)) or not 0 <= threshold < math.inf:
             raise ValueError(f"Config.resample_threshold: {threshold!r} is not a number >= 0")
+        if self.rejuvenate is None:
+            alone = self.sensor == "bearing" and self.association == "maximum_likelihood"
+            object.__setattr__(self, "rejuvenate", REJUVENATE if alone else 0.0)
+        every = self.rejuvenate
+        if (
+            isinstance(every, bool)
+            or not isinstance(every, (int, float))
+            or not 0 <= every < math.inf
+        ):
+            raise ValueError(f"Config.rejuvenate: {every!r} is not a number of metres >= 0")
         if self.forgetting is None:
             object.__setattr__(self, "forgetting", self.association != "known")
         for name in ("exclusive", "clutter", "forgetting", "even", "lazy"):
@@ -88,6 +109,7 @@ class Config:
             clutter=False,
             forgetting=False,
             even=False,
+            rejuvenate=0.0,
         )
         return cls(
             particles=particles,

@@ -31,13 +31,13 @@ OutLog = option(Path, "the log to write, a .npz file")
 
 
 @contextmanager
-def bar(what, compiles=False):
+def bar(what, compiles=False, shown=True):
     """A progress bar on stderr; gives a function of (done, total, text to show), or None without a
     terminal.
 
     `total` is None where no one knows. `compiles`: until the first is done, JAX compiles.
     """
-    if not sys.stderr.isatty():
+    if not (shown and sys.stderr.isatty()):
         yield None
         return
     from rich import console, progress

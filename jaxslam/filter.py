@@ -4,20 +4,23 @@ Each of N particles carries a pose and M landmark EKFs (eq. 6). A step moves the
 and 4), from the motion alone (FastSLAM 1.0, as in the paper) or informed by the measurements (2.0);
 associates, weighs and updates with every measurement of the frame (eqs. 3 and 5: `observation`);
 and resamples. All arrays have fixed sizes and the particles last; `step` and `run` are pure and
-jitted.
+jitted. With several devices each has its share of the particles (`devices`).
 """
 
+import dataclasses
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from jaxslam import ancestry, births, gate, landmarks, observation, resampling
+from jaxslam import ancestry, births, devices, gate, landmarks, observation, resampling
 from jaxslam.ancestry import Ancestry
 from jaxslam.association import CLUTTER, NEW
 from jaxslam.geometry import wrap
 from jaxslam.landmarks import Landmarks
+from jaxslam.listing import pinned
 from jaxslam.observation import Chance
 
 
@@ -76,29 +79,62 @@ def init(config, key, pose=(0.0, 0.0, 0.0), cov=None, landmarks_given=None):
 
     `pose` (x, y, heading), `cov` [3, 3] (None: known exactly). `landmarks_given`: mean [2, L] and
     factor [3, L] of a map that all particles share (for `bearing` also anchor [2, L]), as a tuple.
+    Raises `ValueError` where there are fewer devices than `Config.devices`.
     """
+    cov = np.zeros((3, 3)) if cov is None else cov
+    return made(_start, config, key, pose, cov, landmarks_given)
+
+
+def made(make, config, *given):
+    """The `State` of a jitted function (*given, config), made where it belongs: it may fit no one
+    device."""
+    if config.devices == 1:
+        return make(*given, config)
+    make = partial(make, config=config)
+    specs = layout(jax.eval_shape(make, *given))
+    return jax.jit(make, out_shardings=devices.shardings(specs, config))(*given)
+
+
+def fresh(pose, world, step, bounds, config):
+    """`State` of particles of equal weight, with nothing to catch up with."""
     n = config.particles
-    pose = jnp.asarray(pose, float)
-    root = jnp.zeros((3, 3)) if cov is None else square_root(jnp.asarray(cov, float))
-    drawn = pose[:, None] + root @ start_draws(key, config).astype(pose.dtype)
-    world = landmarks.empty(config, pose.dtype)
-    if landmarks_given is not None:
-        world = births.given(world, landmarks_given)
     return State(
-        pose=drawn.at[2].set(wrap(drawn[2])),
+        pose=pose,
         landmarks=world,
         log_weight=jnp.full(n, -jnp.log(n), pose.dtype),
-        step=jnp.zeros((), jnp.int32),
-        bounds=gate.of_rows(world),
+        step=jnp.asarray(step, jnp.int32),
+        bounds=bounds,
         ancestry=ancestry.new(config) if config.lazy and config.resample_threshold else None,
     )
 
 
-def settled(state):
+@partial(jax.jit, static_argnames="config")
+def _start(key, pose, cov, landmarks_given, config):
+    n = config.particles
+    pose = jnp.asarray(pose, float)
+    root = square_root(jnp.asarray(cov, float))
+    # Products one by one: a matrix product rounds by the device.
+    normals = start_draws(key, config).astype(pose.dtype)
+    drawn = pose[:, None] + sum(root[:, i, None] * normals[i] for i in range(3))
+    one = landmarks.empty(dataclasses.replace(config, particles=1, devices=1), pose.dtype)
+    if landmarks_given is not None:
+        one = births.given(one, landmarks_given)
+    world = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*leaf.shape[:-1], n)), one)
+    return fresh(drawn.at[2].set(wrap(drawn[2])), world, 0, gate.of_rows(one), config)
+
+
+@partial(jax.jit, static_argnames="config")
+def settled(state, config):
     """The state with every landmark where its particle is: to read the map, not to go on faster."""
     if state.ancestry is None:
         return state
-    world, past = ancestry.update(state.landmarks, state.ancestry, True)
+
+    def update(world, past):
+        return ancestry.update(world, past, True, config)
+
+    specs = layout(state)
+    specs = specs.landmarks, specs.ancestry
+    world, past = devices.divided(update, specs, specs, config)(state.landmarks, state.ancestry)
     return state._replace(landmarks=world, ancestry=past)
 
 
@@ -125,11 +161,37 @@ def draws(key, step, config):
     return Chance(normals, uniform, jax.random.uniform(jax.random.fold_in(choose, 1), shape, float))
 
 
+def layout(state):
+    """How the leaves of a `State` lie on several devices."""
+    return devices.same(state)._replace(
+        pose=devices.lanes(state.pose),
+        landmarks=devices.lanes(state.landmarks),
+        log_weight=devices.lanes(state.log_weight),
+    )
+
+
 @partial(jax.jit, static_argnames="config")
 def step(key, state, odometry, measurements, params, config):
     """One step: move, associate and weigh, update, resample. Returns (State, Info)."""
-    chance = draws(key, state.step, config)
-    return advance(chance, state, odometry, measurements, params, config)
+    given = draws(key, state.step, config), state, odometry, measurements, params
+    if config.devices == 1:
+        return advance(*given, config)
+    rest = devices.ALL
+    chance = devices.lanes(given[0]._replace(uniform=None))._replace(uniform=rest)
+    return devices.divided(
+        partial(advance, config=config),
+        (chance, layout(state), rest, rest, rest),
+        (layout(state), _info_specs()),
+        config,
+    )(*given)
+
+
+def _info_specs():
+    row, table = jax.ShapeDtypeStruct((1,), float), jax.ShapeDtypeStruct((1, 1), float)
+    shared = devices.lanes(
+        dict(pose=table, log_weight=row, match=table, birth=table, log_choice=row)
+    )
+    return Info(**dict.fromkeys(Info._fields, devices.ALL) | shared)
 
 
 def advance(chance, state, odometry, measurements, params, config):
@@ -140,33 +202,38 @@ def advance(chance, state, odometry, measurements, params, config):
 
 def conclude(chance, state, seen, active, config):
     """The second half of a step: weights of what was `seen` (`Observed`), estimate, resampling."""
-    pose, density, match = seen.pose, seen.density, seen.match
+    # Of all particles: every device works out the same from the same.
+    pose, density, before = devices.whole((seen.pose, seen.density, state.log_weight), config)
     # A pose that is not a number fits nothing, which would count as new landmarks: no weight.
     sound = jnp.isfinite(pose).all(0)
     density = jnp.where(sound, density, jnp.nan)
-    log_weight, log_evidence, flags = _weigh(state.log_weight, density)
-    weight = jnp.exp(log_weight)
+    log_weight, log_evidence, flags = _weigh(before, density)
+    weight = pinned(jnp.exp(log_weight))
     estimate = _estimate(jnp.where(sound, pose, 0), weight)
     ess = 1 / jnp.sum(weight**2)
     threshold = config.resample_threshold
     wanted = active & ((ess < threshold * config.particles) | (threshold >= 1))
     moved = State(pose, seen.landmarks, log_weight, state.step + 1, seen.bounds, seen.ancestry)
     resampled, ancestors = _resample(moved, wanted, chance.uniform, config)
+    match = devices.one(seen.match, estimate.best, config)
+    overflow, forgotten, outliers = devices.total(
+        jnp.stack([*seen.counts.sum(1), jnp.sum(seen.match == CLUTTER, dtype=jnp.int32)]), config
+    )
     info = Info(
-        pose=pose,
-        log_weight=log_weight,
+        pose=seen.pose,
+        log_weight=devices.mine(log_weight, config),
         estimate=estimate,
         ess=ess,
         log_evidence=log_evidence,
         resampled=wanted,
         ancestors=ancestors,
-        match=match,
+        match=seen.match,
         birth=seen.birth,
         log_choice=seen.log_choice,
-        new=jnp.sum(match[:, estimate.best] == NEW),
-        outliers=jnp.sum(match == CLUTTER),
-        overflow=seen.counts[0].sum(),
-        forgotten=seen.counts[1].sum(),
+        new=jnp.sum(match == NEW),
+        outliers=outliers,
+        overflow=overflow,
+        forgotten=forgotten,
         nonfinite=flags[0],
         degenerate=flags[1],
     )
@@ -186,7 +253,7 @@ def run(key, state, odometry, measurements, params, config, summarise=lambda inf
 
 def _weigh(log_weight, density):
     """Normalised log weights, log evidence of the step, and flags (non-finite, degenerate)."""
-    raw = log_weight + density
+    raw = pinned(log_weight + density)
     finite = jnp.isfinite(raw)
     # A particle that already had no weight is not news.
     nonfinite = jnp.sum(~finite & (log_weight > -jnp.inf))
@@ -194,37 +261,40 @@ def _weigh(log_weight, density):
     log_evidence = jax.nn.logsumexp(jnp.where(finite, raw, -jnp.inf))
     even = jnp.full_like(raw, -jnp.log(len(raw)))
     normalised = jnp.where(finite, raw - log_evidence, -jnp.inf)
-    return jnp.where(degenerate, even, normalised), log_evidence, (nonfinite, degenerate)
+    log_weight = pinned(jnp.where(degenerate, even, normalised))
+    return log_weight, log_evidence, (nonfinite, degenerate)
 
 
 def _estimate(pose, weight):
     """Weighted mean (circular in heading) and covariance of the poses, and the heaviest one."""
+    # Sums, not matrix products: how these add up depends on the number of threads.
     x, y, heading = pose
-    mean = jnp.stack(
-        [
-            weight @ x,
-            weight @ y,
-            jnp.arctan2(weight @ jnp.sin(heading), weight @ jnp.cos(heading)),
-        ]
-    )
-    off = jnp.stack([x - mean[0], y - mean[1], wrap(heading - mean[2])])
-    return Estimate(mean, (off * weight) @ off.T, jnp.argmax(weight))
+    parts = jnp.stack([x, y, jnp.sin(heading), jnp.cos(heading)])
+    x_mean, y_mean, s, c = pinned(parts * weight).sum(1)
+    mean = jnp.stack([x_mean, y_mean, jnp.arctan2(s, c)])
+    off = pinned(jnp.stack([x - mean[0], y - mean[1], wrap(heading - mean[2])]))
+    cov = pinned(off[:, None] * (off * weight)).sum(2)
+    return Estimate(mean, cov, jnp.argmax(weight))
 
 
 def _resample(state, wanted, uniform, config):
-    """Systematic resampling of poses and maps where wanted; also the ancestors."""
-    n = config.particles
-    same = jnp.arange(n, dtype=jnp.int32)
-    if config.resample_threshold == 0:
-        return state, same
+    """Systematic resampling of poses and maps where wanted; also the ancestors [N].
 
-    ancestors = jnp.where(wanted, resampling.systematic(state.log_weight, uniform), same)
-    pose = resampling.gather(state.pose, ancestors, wanted)
-    log_weight = jnp.where(wanted, -jnp.log(n), state.log_weight)
+    Poses and weights given are of all particles; those that come back are of a device's own.
+    """
+    n = config.particles
+    ancestors = jnp.arange(n, dtype=jnp.int32)
+    pose, log_weight = state.pose, state.log_weight
     world, past = state.landmarks, state.ancestry
-    if past is None:
-        world = resampling.gather(world, ancestors, wanted)
-    else:
-        past = ancestry.resampled(past, ancestors, wanted)
+    if config.resample_threshold:
+        chosen = pinned(resampling.systematic(log_weight, uniform))
+        ancestors = jnp.where(wanted, chosen, ancestors)
+        pose = pose[:, ancestors]
+        log_weight = jnp.where(wanted, -jnp.log(n), log_weight)
+        if past is None:
+            world = resampling.gather(world, ancestors, wanted, config)
+        else:
+            past = ancestry.resampled(past, ancestors, wanted)
+    pose, log_weight = devices.mine((pose, log_weight), config)
     state = state._replace(pose=pose, landmarks=world, log_weight=log_weight, ancestry=past)
     return state, ancestors

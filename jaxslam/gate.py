@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import births, geometry, sensors
+from jaxslam import births, devices, geometry, sensors
 
 FEW = 32  # slots are all looked at
 
@@ -55,6 +55,18 @@ def widened(bounds, world, slots):
     )
 
 
+def joined(bounds, config):
+    """The bounds that hold on every device, from its own."""
+    used = jnp.where(bounds.used, -1.0, 0.0).astype(bounds.spread.dtype)
+    low, high, spread, used = jnp.split(
+        devices.least(
+            jnp.concatenate([bounds.low, -bounds.high, -bounds.spread[None], used[None]]), config
+        ),
+        [2, 4, 5],
+    )
+    return Bounds(low, -high, -spread[0], used[0] < 0)
+
+
 def unlimited(bounds, born):
     """The bounds without any for slots [M] in which landmarks were `born`, until next looked at."""
     return Bounds(
@@ -89,7 +101,9 @@ def concerned(config, bounds, sensor_pose, measurements, params, extra):
     if config.sensor == "bearing" or config.association == "sampled" or informed_position:
         return used
     x, y = sensor_pose[0], sensor_pose[1]
-    here_low, here_high = jnp.stack([x.min(), y.min()]), jnp.stack([x.max(), y.max()])
+    ends = jnp.stack([x.min(), y.min(), -x.max(), -y.max(), -jnp.asarray(extra, x.dtype)])
+    ends = devices.least(ends, config)
+    here_low, here_high, extra = ends[:2], -ends[2:4], -ends[4]
     gap = jnp.maximum(bounds.low - here_high[:, None], here_low[:, None] - bounds.high)
     nearest = jnp.hypot(*jnp.maximum(gap, 0.0)) * 0.9999
     concerns = ~(nearest >= params.view_range)  # what is not a number concerns

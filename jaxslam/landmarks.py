@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import geometry, sensors
+from jaxslam import devices, geometry, sensors
 from jaxslam.geometry import wrap
+from jaxslam.listing import added, pinned
 
 NODES, BETWEEN = 5, 0.75  # normals a bearing landmark is split into; share of variance between
 _node, _weight = np.polynomial.hermite_e.hermegauss(NODES)
@@ -109,8 +110,7 @@ def score(sensor, scorer, value, cov, params):
 def update(sensor, sensor_pose, mean, factor, anchor, value, cov, params):
     """One landmark's EKF update: mean, factor, log predictive density of the measurement.
 
-    A 2-D measurement is two whitened scalars, both linearised at the mean before the update, so
-    that the product of their densities is the joint one.
+    A 2-D measurement is two whitened scalars, both linearised at the mean before the update.
     """
     if sensor == "bearing":
         return _update_bearing(sensor_pose, mean, factor, anchor, value[0], params)
@@ -120,13 +120,8 @@ def update(sensor, sensor_pose, mean, factor, anchor, value, cov, params):
     else:
         innovations = (value[0] - seen.value[0], wrap(value[1] - seen.value[1]))
         rows, variances = seen.rows, seen.noise
-    log_density, start = 0.0, mean
-    for row, innovation, variance in zip(rows, innovations, variances, strict=True):
-        moved = row[0] * (mean[0] - start[0]) + row[1] * (mean[1] - start[1])
-        rest = innovation - moved
-        mean, factor, s = geometry.scalar_update(mean, factor, row, rest, variance)
-        log_density -= 0.5 * (rest * rest / s + jnp.log(s) + sensors.LOG_2PI)
-    return mean, factor, log_density
+    mean, factor, square, log = geometry.pair_update(mean, factor, rows, innovations, variances)
+    return mean, factor, -0.5 * (square + log) - sensors.LOG_2PI
 
 
 def bend(along, stretch):
@@ -173,7 +168,8 @@ def _update_bearing(sensor_pose, mean, factor, anchor, value, params):
     # A loop, as what it hands on are arrays: else XLA works all out again for each of the sums.
     split = jax.tree.map(lambda v: jnp.array(v, jnp.result_type(l11)), SPLIT)
     part, cov, share = jax.lax.map(one, split)
-    log_density = jax.nn.logsumexp(share, 0)
+    top = jax.lax.stop_gradient(share.max(0))
+    log_density = top + jnp.log(added(jnp.exp(share - top)))
     mean, factor = _merge(part, cov, jnp.exp(share - log_density))
     return (mean[0], jnp.maximum(mean[1], sensors.LEAST_INVERSE_DEPTH)), factor, log_density
 
@@ -181,13 +177,13 @@ def _update_bearing(sensor_pose, mean, factor, anchor, value, params):
 def _merge(mean, factor, weight):
     """Mean and factor of a mixture of normals, along the first axis; sums of squares throughout."""
     l11, l21, l22 = factor
-    m0, m1 = ((weight * m).sum(0) for m in mean)
+    m0, m1 = (added(weight * m) for m in mean)
     d0, d1 = mean[0] - m0, mean[1] - m1
-    top = jnp.sqrt((weight * (l11 * l11 + d0 * d0)).sum(0))
-    side = (weight * (l11 * l21 + d0 * d1)).sum(0) / top
+    top = jnp.sqrt(added(weight * (l11 * l11 + d0 * d0)))
+    side = added(weight * (l11 * l21 + d0 * d1)) / top
     slope = side / top
     off, away = l21 - slope * l11, d1 - slope * d0
-    low = jnp.sqrt((weight * (off * off + l22 * l22 + away * away)).sum(0))
+    low = jnp.sqrt(added(weight * (off * off + l22 * l22 + away * away)))
     return (m0, m1), (top, side, low)
 
 
@@ -245,7 +241,14 @@ def summarise(world, weight, best, params, config):
 
     The covariance is the mixture's: the mean of the particles' own, and the spread of their means.
     """
-    mine = jax.tree.map(lambda leaf: leaf[..., best], world)
+    shared = devices.same((best, params))
+    specs = devices.lanes(world), devices.lanes(weight), *shared
+    summary = devices.divided(partial(_summarise, config=config), specs, devices.ALL, config)
+    return summary(world, weight, best, params)
+
+
+def _summarise(world, weight, best, params, config):
+    mine = devices.one(world, best, config)
     centre, _, depth_known = to_world(config.sensor, mine)
     confirmed = True if mine.log_odds is None else mine.log_odds >= params.existence_confirm
 
@@ -256,18 +259,19 @@ def summarise(world, weight, best, params, config):
         same = (world.birth == birth) & (world.count > 0)
         at = jnp.where(same, slots[:, None], -1).max(0)
         row = jax.tree.map(lambda leaf: leaf[..., jnp.maximum(at, 0), lane], world)
-        share = weight * (at >= 0)
+        row, share = devices.whole((row, weight * (at >= 0)), config)
         point, cov, known = to_world(config.sensor, row)
         share = jnp.where(known, share, 0)
-        share = share / share.sum()
-        dx, dy = point[0] - centre[0], point[1] - centre[1]
-        mx, my = jnp.sum(share * jnp.where(known, dx, 0)), jnp.sum(share * jnp.where(known, dy, 0))
+        # Pinned: joined with what comes before, sums would be rounded by the number of devices.
+        share = pinned(share / pinned(share).sum())
+        dx, dy = (jnp.where(known, p - c, 0) for p, c in zip(point, centre, strict=True))
+        mx, my = pinned(jnp.stack([share * dx, share * dy])).sum(1)
         spread = ((dx - mx) ** 2, (dx - mx) * (dy - my), (dy - my) ** 2)
-        total = [
-            jnp.sum(jnp.where(share > 0, share * (own + between), 0))
+        parts = [
+            jnp.where(share > 0, share * (own + between), 0)
             for own, between in zip(cov, spread, strict=True)
         ]
-        return jnp.stack([centre[0] + mx, centre[1] + my]), jnp.stack(total)
+        return jnp.stack([centre[0] + mx, centre[1] + my]), pinned(jnp.stack(parts)).sum(1)
 
     mean, cov = jax.lax.map(lambda args: one(*args), (mine.birth, jnp.stack(centre, -1)))
     kept = (mine.count > 0) & confirmed & depth_known

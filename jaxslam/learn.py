@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxslam import likelihood
+from jaxslam import devices, likelihood
 from jaxslam.atomic import replacing
 from jaxslam.config import Params
 from jaxslam.paramfile import validate
@@ -106,25 +106,7 @@ def scores(free, params, data, which, keys, config, names, discount, estimator="
         slope = jnp.stack([jax.grad(partial(from_free, n))(at[i]) for i, n in enumerate(names)])
         return found._replace(total=by_free(found.total, slope), steps=by_free(found.steps, slope))
 
-    return spread(one, (free, which, keys))
-
-
-def spread(one, items):
-    """`one` of every item (first axis), shared out over the devices; on each, one at a time."""
-    count, devices = len(jax.tree.leaves(items)[0]), jax.devices()
-    each = -(-count // len(devices))
-    if len(devices) == 1 or count == 1:
-        return jax.lax.map(one, items)
-    # Filled up with the first ones, so that all devices have as many.
-    index = np.arange(each * len(devices)) % count
-    mesh = jax.make_mesh((len(devices),), ("item",), axis_types=(jax.sharding.AxisType.Auto,))
-    share = jax.sharding.PartitionSpec("item")
-    mapped = jax.shard_map(
-        lambda part: jax.lax.map(one, part),
-        mesh=mesh, in_specs=share, out_specs=share, check_vma=False,
-    )  # fmt: skip
-    found = mapped(jax.tree.map(lambda leaf: leaf[index], items))
-    return jax.tree.map(lambda leaf: leaf[:count], found)
+    return devices.spread(one, (free, which, keys), len(jax.devices()))
 
 
 def evidence(logs, config, params, seeds=8, seed=0):

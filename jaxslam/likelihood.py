@@ -303,7 +303,7 @@ def _step(carry, frame, params, key, config, names, through, estimator, discount
     # Plain differentiation takes the weights after resampling for constants.
     own_after = jnp.where(info.resampled, 0.0, own) if estimator == "plain" else own
     pose_dot, world_dot, own_after = resampling.gather(
-        (pose_dot, world_dot, own_after), info.ancestors, info.resampled
+        (pose_dot, world_dot, own_after), info.ancestors, info.resampled, config
     )
     log_evidence = info.log_evidence + frame_terms(measurements, params)
     sums = carry.total + gradient, carry.shared + extra, jnp.minimum(carry.ess, info.ess)

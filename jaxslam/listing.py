@@ -1,4 +1,4 @@
-"""Where masks are true, fast on a CPU; and loops over as many."""
+"""Where masks are true, and loops over as many, fast on a CPU; sums in order, work done once."""
 
 import jax
 import jax.numpy as jnp
@@ -32,3 +32,39 @@ def rounds(count, body, start):
     return jax.lax.while_loop(
         lambda carry: carry[0] < count, lambda carry: (carry[0] + 1, body(*carry)), (0, start)
     )[1]
+
+
+def added(rows):
+    """Sum over the first axis, from the first row to the last.
+
+    The order of `jnp.sum` depends on the array's shape, and so on how many particles are worked on
+    together: results would differ, in the last bit, with blocks and devices.
+    """
+    start = jnp.zeros_like(rows[0])
+    unroll = max(1, min(len(rows), WIDTH))
+    return jax.lax.fori_loop(0, len(rows), lambda i, total: total + rows[i], start, unroll=unroll)
+
+
+def pinned(tree):
+    """The same arrays, made where this stands and nowhere else.
+
+    XLA works cheap things out anew in each fusion that uses them, and joins other products and
+    sums there into one rounding.
+    """
+    return jax.lax.optimization_barrier(tree)
+
+
+def once(sure, work):
+    """What `work` returns, as arrays: a branch ends fusion. `sure` is true, but not so that XLA can
+    tell.
+
+    Else XLA repeats all arithmetic that it takes for cheap (normals, bearings) in everything that
+    is worked out from it, and where that is a concatenation does it one number at a time.
+    """
+
+    def never():
+        return jax.tree.map(
+            lambda part: jnp.full(part.shape, jnp.nan, part.dtype), jax.eval_shape(work)
+        )
+
+    return jax.lax.cond(sure, work, never)

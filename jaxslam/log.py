@@ -277,7 +277,7 @@ def save_log(path, log):
     if path.suffix != ".npz":
         raise ValueError(f"{path}: a log is a .npz file; name it {path.name}.npz")
     with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
-        for name, array in _entries(log).items():
+        for name, array in entries(log).items():
             # A fixed date: the same log makes the same bytes.
             entry = zipfile.ZipInfo(name + ".npy", (1980, 1, 1, 0, 0, 0))
             entry.compress_type = zipfile.ZIP_DEFLATED
@@ -285,7 +285,7 @@ def save_log(path, log):
                 np.lib.format.write_array(member, array, allow_pickle=False)
 
 
-def _entries(log):
+def entries(log):
     """The file's entries, by name."""
     entries = {"schema": np.int64(SCHEMA)}
     for part, prefix in ((log, ""), (log.truth, "truth/"), (log.plan, "plan/")):

@@ -1,10 +1,82 @@
 """A frame's matched measurements: the landmarks they change, read, updated and written together."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
 from jaxslam.landmarks import update
-from jaxslam.listing import listed, rounds
+from jaxslam.listing import added, listed, rounds
+
+
+class Rows(NamedTuple):
+    """Where identities are known, and nothing else is looked at: a block's landmarks, one of every
+    measurement. The `slot` [K] of each, if it is `there` [K]; the measurement that was the `first`
+    [K] to name it; and how many `earlier` [K] ones did."""
+
+    slot: jax.Array
+    there: jax.Array
+    first: jax.Array
+    earlier: jax.Array
+
+
+def by_name(config):
+    """Whether a look concerns the slots of the measured identities alone (`Rows`)."""
+    return config.association == "known" and not config.forgetting
+
+
+def rows_of(measurements, slots):
+    """`Rows` of a frame, in a map of so many slots."""
+    slot = measurements.identity
+    there = measurements.valid & (slot >= 0) & (slot < slots)
+    same = (slot[:, None] == slot) & there[:, None] & there
+    earlier = jnp.tril(same, -1).sum(1, dtype=jnp.int32)
+    slot = jnp.where(there, slot, slots).astype(jnp.int32)
+    return Rows(slot, there, jnp.argmax(same, 1).astype(jnp.int32), earlier)
+
+
+def fitted(sensor, sensor_pose, world, measurements, params):
+    """Every row's landmark [K, n] updated by its measurement: mean, factor, log density."""
+    value, cov = (tuple(part.T[:, :, None]) for part in map(jnp.asarray, measurements[:2]))
+    anchor = None if world.anchor is None else tuple(world.anchor)
+    return update(
+        sensor, sensor_pose, tuple(world.mean), tuple(world.factor), anchor, value, cov, params
+    )
+
+
+def updated_rows(sensor, sensor_pose, world, rows, match, measurements, params, fit):
+    """`updated` of a block whose landmarks are `Rows`, `fit` as `fitted` says; counts are not
+    marked.
+
+    Measurements that name a landmark again come after, one at a time.
+    """
+    inlier = jnp.log1p(-params.outlier)
+
+    def some(world, fit, matched):
+        mean, factor, log_density = fit
+
+        def put(old, new):
+            return jnp.stack([jnp.where(matched, b, a) for a, b in zip(old, new, strict=True)])
+
+        after = world._replace(
+            mean=put(world.mean, mean),
+            factor=put(world.factor, factor),
+            count=world.count + matched,
+        )
+        return after, added(jnp.where(matched, inlier + log_density, 0.0))
+
+    def again(carry):
+        i, world, density = carry
+        here = (rows.first == jnp.arange(len(match))[:, None]) & (rows.earlier == i) & rows.there
+        k = jnp.argmax(here, 1)
+        given = jax.tree.map(lambda leaf: leaf[k] if leaf.ndim else leaf, measurements)
+        fit = fitted(sensor, sensor_pose, world, given, params)
+        world, more = some(world, fit, here.any(1)[:, None] & (match[k] >= 0))
+        return i + 1, world, density + more
+
+    first = some(world, fit, (match >= 0) & (rows.earlier == 0)[:, None])
+    most = rows.earlier.max()
+    return jax.lax.while_loop(lambda carry: carry[0] <= most, again, (1, *first))[1:]
 
 
 def updated(sensor, sensor_pose, world, match, measurements, params, again):
@@ -29,7 +101,7 @@ def updated(sensor, sensor_pose, world, match, measurements, params, again):
         )
         new = jnp.stack(mean), jnp.stack(factor), -1 - jnp.abs(old.count)
         world = _write(world, slot, new)
-        return i + 1, world, density + jnp.where(slot >= 0, inlier + log_density, 0).sum(0)
+        return i + 1, world, density + added(jnp.where(slot >= 0, inlier + log_density, 0.0))
 
     start = 0, world, jnp.zeros_like(sensor_pose[0])
     if not again:

@@ -25,7 +25,7 @@ from jaxslam import (
 from jaxslam.ancestry import Ancestry
 from jaxslam.association import CLUTTER, NEW
 from jaxslam.landmarks import Landmarks
-from jaxslam.listing import rounds
+from jaxslam.listing import added, listed, once, pinned, rounds
 
 SWEEP = 16  # steps
 SMALLEST = gate.FEW  # slots of which a block takes copies; four times as many, and so on, or all
@@ -66,15 +66,22 @@ def observe(state, chance, odometry, measurements, params, config, frozen=False)
     density's derivative is that of the measurements alone (see `likelihood`).
     """
     hold = jax.lax.stop_gradient if frozen else lambda value: value
-    pose, n = state.pose, config.particles
+    pose, n = state.pose, state.pose.shape[1]
     measurements = sensors.rescaled(measurements, params)
     params = params._replace(sigma_bearing=geometry.norm(params.sigma_bearing, params.caution))
+    if config.sensor == "bearing" and config.association == "maximum_likelihood":
+        params = sensors.at_most_one_new(params)
     if not config.clutter:
         params = params._replace(outlier=jnp.zeros(()))
     # Outside the loop: XLA would work out cosine and sine again for every landmark.
+    sure = state.step >= 0
+    chance = chance._replace(normals=once(sure, lambda: chance.normals))
     u = jnp.zeros_like(pose) if config.proposal == "informed" else chance.normals
-    predicted = hold(jnp.stack(motion.sample(pose, odometry, params, u)))
-    sensor_pose = jnp.stack(sensors.pose_of(tuple(predicted), params))
+    # Pinned: worked out again where it is used, it would be rounded otherwise.
+    predicted = once(sure, lambda: motion.sample(pose, odometry, params, u))
+    predicted = pinned(hold(jnp.stack(predicted)))
+    sensor_pose = once(sure, lambda: sensors.pose_of(tuple(predicted), params))
+    sensor_pose = pinned(jnp.stack(sensor_pose))
     rows = _concerned(state, predicted, sensor_pose, odometry, measurements, params, config)
     rows &= measurements.active
     world, past, rows = _caught_up(state, rows, config)
@@ -89,12 +96,16 @@ def observe(state, chance, odometry, measurements, params, config, frozen=False)
     for size, chosen in _sizes(config, rows.sum()):
         seen = _blocks(seen, particles, rows, frame, config, hold, size, chosen)
     seen, found = seen
+    found = gate.joined(found, config)
     if past is not None:  # what was free has nothing to catch up with
         past = past._replace(
             chain=jnp.where(found.used & ~state.bounds.used, ancestry.CURRENT, past.chain)
         )
     touched = rows | found.used
-    bounds = jax.tree.map(lambda new, old: jnp.where(touched, new, old), found, state.bounds)
+    if matched.by_name(config):  # no bounds are asked for
+        bounds = gate.unlimited(state.bounds, found.used | (rows & state.bounds.used))
+    else:
+        bounds = jax.tree.map(lambda new, old: jnp.where(touched, new, old), found, state.bounds)
     return seen._replace(bounds=bounds, ancestry=past)
 
 
@@ -120,7 +131,7 @@ def _caught_up(state, rows, config):
         looked = rows | (state.bounds.used & short & (state.step % SWEEP == 0))
     world, past = state.landmarks, state.ancestry
     if past is not None:
-        world, past = ancestry.update(world, past, looked | ancestry.last_of(past))
+        world, past = ancestry.update(world, past, looked | ancestry.last_of(past), config)
     return world, past, looked
 
 
@@ -128,7 +139,7 @@ def _sizes(config, count):
     """Numbers of slots that a block may look at, and which to go with: the smallest that `count`
     fits in."""
     total, size, sizes = config.landmarks, SMALLEST, []
-    if config.association == "known" and not config.forgetting and config.measurements < total:
+    if matched.by_name(config):
         yield config.measurements, True
         return
     while size < total:
@@ -140,16 +151,16 @@ def _sizes(config, count):
         least = size
 
 
-def _widths(config):
-    """(start, width, number) of blocks that make up all particles: even ones, and perhaps a rest.
+def _widths(n, most):
+    """(start, width, number) of blocks that make up n particles, alike but for one particle.
 
-    A whole number of blocks, if one not much smaller than `block` allows it, is compiled once.
+    A narrow rest would be compiled to other arithmetic, and be rounded otherwise.
     """
-    n, most = config.particles, min(config.block, config.particles)
-    width = next((w for w in range(most, most // 2, -1) if n % w == 0), most)
-    yield 0, width, n // width
-    if n % width:
-        yield n - n % width, n % width, 1
+    blocks = -(-n // most)
+    width, more = divmod(n, blocks)
+    yield 0, width, blocks - more
+    if more:
+        yield n - more * (width + 1), width + 1, more
 
 
 def _blocks(whole, particles, rows, frame, config, hold, size, chosen):
@@ -158,13 +169,14 @@ def _blocks(whole, particles, rows, frame, config, hold, size, chosen):
     odometry, measurements, params, free, number = frame
     named = measurements
     slots = jnp.arange(total, dtype=jnp.int32)
-    if size < total:
+    own, taken = None, None if size == total else (slots[:size], rows.sum())
+    put = taken
+    if matched.by_name(config):
+        own = matched.rows_of(measurements, total)
+        slots, taken, put = own.slot, listed(own.there), listed(own.there & (own.earlier == 0))
+    elif size < total:
         slots = jnp.nonzero(rows, size=size, fill_value=total)[0].astype(jnp.int32)
-        local = jnp.full(total, size, jnp.int32)
-        local = local.at[slots].set(jnp.arange(size, dtype=jnp.int32), mode="drop")
-        identity = jnp.clip(measurements.identity, 0, total - 1)
-        there = (measurements.identity >= 0) & (measurements.identity < total)
-        measurements = measurements._replace(identity=jnp.where(there, local[identity], size))
+        measurements = _renamed(measurements, slots, total)
 
     def block(i, carry, first, width):
         carry, bounds = carry
@@ -172,17 +184,17 @@ def _blocks(whole, particles, rows, frame, config, hold, size, chosen):
         mine = jax.tree.map(
             lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, width, -1), particles
         )
-        before = _taken(carry.landmarks, slots, rows.sum(), start, width)
+        before = _taken(carry.landmarks, slots, taken, start, width)
         # Inside a branch the slices are arrays of their own. Fused into the arithmetic, in-place
         # reading and writing of the large arrays stops its vectorisation: ten times slower.
         done = jax.lax.cond(
             measurements.active,
-            lambda *mine: _look(*mine, odometry, measurements, params, config, hold),
+            lambda *mine: _look(*mine, own, odometry, measurements, params, config, hold),
             lambda *mine: _nothing(*mine, odometry, params, config, hold),
             mine,
             before,
         )
-        if size < total:
+        if size < total and own is None:
             at = slots[jnp.clip(done.match, 0, size - 1)]
             done = done._replace(match=jnp.where(done.match >= 0, at, done.match))
         rest = jax.tree.map(
@@ -192,40 +204,51 @@ def _blocks(whole, particles, rows, frame, config, hold, size, chosen):
         )
         fixed = dict(anchor=None, birth=None)  # what a look leaves as it is
         world = _put(
-            carry.landmarks._replace(**fixed), done.landmarks._replace(**fixed), slots,
-            rows.sum(), start,
+            carry.landmarks._replace(**fixed), done.landmarks._replace(**fixed), slots, put, start,
         )._replace(anchor=carry.landmarks.anchor, birth=carry.landmarks.birth)  # fmt: skip
         at = tuple(sensors.pose_of(tuple(done.pose), params))
-        bounds = gate.widened(bounds, jax.lax.stop_gradient(done.landmarks), slots)
+        if own is None:
+            bounds = gate.widened(bounds, jax.lax.stop_gradient(done.landmarks), slots)
         world, born, lost = births.create(
             config, world, start, at, done.match, free, named, params, number
         )
         counts = jax.lax.dynamic_update_slice_in_dim(rest.counts, lost[None], start, -1)
         return rest._replace(landmarks=world, counts=counts), gate.unlimited(bounds, born)
 
-    for first, width, blocks in _widths(config):
-        whole = jax.lax.fori_loop(
-            0,
-            blocks if total <= SMALLEST else jnp.where(chosen, blocks, 0),
-            partial(block, first=first, width=width),
-            whole,
-        )
+    for first, width, blocks in _widths(particles[0].shape[1], config.block):
+        # A number that XLA does not know: it would open up a loop of one round, and fuse and round
+        # otherwise than in a loop of many.
+        count = pinned(jnp.where(chosen, blocks, 0))
+        whole = rounds(count, partial(block, first=first, width=width), whole)
     return whole
 
 
-def _taken(world, slots, count, start, width):
-    """The first `count` of `slots` of `width` particles from `start` on; the others are empty."""
-    if len(slots) == len(world.count):
+def _renamed(measurements, slots, total):
+    """The measurements with the places of their slots among `slots` [S] as identities; S: none."""
+    size, given = len(slots), measurements.identity
+    local = jnp.full(total, size, jnp.int32)
+    local = local.at[slots].set(jnp.arange(size, dtype=jnp.int32), mode="drop")
+    there = (given >= 0) & (given < total)
+    identity = jnp.where(there, local[jnp.clip(given, 0, total - 1)], size)
+    return measurements._replace(identity=identity)
+
+
+def _taken(world, slots, rows, start, width):
+    """Of `slots` [S] the `rows` listed (indices, and how many), of `width` particles from `start`
+    on; the others are empty. None: all slots."""
+    if rows is None:
         return jax.tree.map(
             lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, width, -1),
             world,
         )
 
+    which, count = rows
+
     def one(i, parts):
         def take(leaf, part):
-            at = _corner(leaf, slots[i], start)
+            at = _corner(leaf, slots[which[i]], start)
             row = jax.lax.dynamic_slice(leaf, at, (*leaf.shape[:-2], 1, width))
-            return jax.lax.dynamic_update_slice_in_dim(part, row, i, leaf.ndim - 2)
+            return jax.lax.dynamic_update_slice_in_dim(part, row, which[i], leaf.ndim - 2)
 
         return jax.tree.map(take, world, parts)
 
@@ -241,19 +264,22 @@ def _corner(leaf, slot, start):
     return tuple(jnp.asarray(i, jnp.int32) for i in (*(0,) * (leaf.ndim - 2), slot, start))
 
 
-def _put(world, part, slots, count, start):
+def _put(world, part, slots, rows, start):
     """The map with what `_taken` took replaced."""
-    if len(slots) == len(world.count):
+    if rows is None:
         return jax.tree.map(
             lambda leaf, new: jax.lax.dynamic_update_slice_in_dim(leaf, new, start, -1),
             world,
             part,
         )
 
+    which, count = rows
+
     def one(i, leaves):
         def put(leaf, new):
-            row = jax.lax.dynamic_slice_in_dim(new, i, 1, new.ndim - 2)
-            return jax.lax.dynamic_update_slice(leaf, row, _corner(leaf, slots[i], start))
+            row = jax.lax.dynamic_slice_in_dim(new, which[i], 1, new.ndim - 2)
+            at = _corner(leaf, slots[which[i]], start)
+            return jax.lax.dynamic_update_slice(leaf, row, at)
 
         return jax.tree.map(put, leaves, part)
 
@@ -272,8 +298,11 @@ def _nothing(particles, before, odometry, params, config, hold):
     return Observed(predicted, before, zero, match, match, zero, counts, normals)
 
 
-def _look(particles, before, odometry, measurements, params, config, hold):
-    """`Observed`: associate, move (when informed), weigh and update, forget."""
+def _look(particles, before, rows, odometry, measurements, params, config, hold):
+    """`Observed`: associate, move (when informed), weigh and update, forget.
+
+    `rows`: `matched.Rows` where these are the landmarks `before`, else None.
+    """
     pose, predicted, sensor_pose, normals, picks = particles
     sensor, informed = config.sensor, config.proposal == "informed"
     noise = sensors.correlated(params, odometry)
@@ -288,33 +317,81 @@ def _look(particles, before, odometry, measurements, params, config, hold):
     scorer = landmarks.scorer(sensor, seen, before, inlier, by_u)
     new = sensors.log_new_density(sensor, tuple(measurements.value.T), params)
     clutter = sensors.log_clutter_density(sensor, params)
-    match, log_choice = association.associate(
-        config, scorer, measurements, new, clutter, params, picks
-    )
+    if rows is None:
+        match, log_choice = association.associate(
+            config, scorer, measurements, new, clutter, params, picks
+        )
+    else:
+        fit = _fit(sensor, sensor_pose, before, rows, measurements, noise)
+        own = _densities(sensor, sensor_pose, before, inlier, by_u, measurements, params, fit)
+        match, log_choice = association.named(
+            rows, before.count > 0, own, measurements, clutter, picks
+        )
     log_ratio, u = 0.0, normals
     if informed:
-        whitened = proposal.inform(sensor, sensor_pose, axes, before, match, measurements, noise)
+        row = (
+            match if rows is None else jnp.where(match >= 0, jnp.arange(len(match))[:, None], match)
+        )
+        whitened = proposal.inform(sensor, sensor_pose, axes, before, row, measurements, noise)
         u, log_ratio = hold(proposal.draw(whitened, normals))
         predicted = hold(jnp.stack(motion.sample(pose, odometry, params, u)))
         sensor_pose = jnp.stack(sensors.pose_of(tuple(predicted), params))
-    world, density = matched.updated(
-        sensor, tuple(sensor_pose), before, match, measurements, noise,
-        again=config.association == "known" or not config.exclusive,
-    )  # fmt: skip
-    density = density + jnp.where(match == NEW, new[:, None], 0).sum(0)
-    if config.clutter:
-        density = density + jnp.where(match == CLUTTER, clutter, 0).sum(0)
-    if config.even:
-        density = density - _orders(count, (match >= 0).sum(0))
+    if rows is None:
+        again = config.association == "known" or not config.exclusive
+        world, density = matched.updated(
+            sensor, tuple(sensor_pose), before, match, measurements, noise, again
+        )
+    else:
+        if informed:
+            fit = _fit(sensor, sensor_pose, before, rows, measurements, noise)
+        world, density = matched.updated_rows(
+            sensor, tuple(sensor_pose), before, rows, match, measurements, noise, fit
+        )
+    density = _with_unmatched(config, density, match, new, clutter, count)
     forgotten = jnp.zeros_like(match[0])
     if config.forgetting:
         world, forgotten = landmarks.existence(world, seen, params)
     counts = jnp.stack([jnp.zeros_like(forgotten), forgotten]).astype(jnp.int32)
     density = density + log_ratio - log_choice
-    world = landmarks.settle(world)
-    birth = jnp.take_along_axis(world.birth, jnp.maximum(match, 0), 0)
+    birth = world.birth
+    if rows is None:
+        world = landmarks.settle(world)
+        birth = jnp.take_along_axis(birth, jnp.maximum(match, 0), 0)
     birth = jnp.where(match >= 0, birth, match)
     return Observed(predicted, world, density, match, birth, log_choice, counts, u)
+
+
+def _densities(sensor, sensor_pose, before, inlier, by_u, measurements, params, fit):
+    """Log densities [K, n] of measurements under the landmarks of their rows, to associate by.
+
+    With the pose exact and errors independent from frame to frame the update has them already.
+    """
+
+    def scored():
+        anchor = tuple(before.anchor) if before.anchor is not None else None
+        seen = sensors.observe(sensor, tuple(sensor_pose), tuple(before.mean), anchor, params)
+        scorer = landmarks.scorer(sensor, seen, before, inlier, by_u)
+        return landmarks.score(sensor, scorer, *association.columns(measurements), params)
+
+    if sensor == "bearing" or by_u is not None:
+        return scored()
+    return jax.lax.cond(params.correlation > 0, scored, lambda: inlier + fit[2])
+
+
+def _fit(sensor, sensor_pose, before, rows, measurements, params):
+    """`matched.fitted`, as arrays."""
+    given = sensor, tuple(sensor_pose), before, measurements, params
+    return once(rows.earlier[0] >= 0, lambda: matched.fitted(*given))
+
+
+def _with_unmatched(config, density, match, new, clutter, count):
+    """Log densities [n] of a frame's matches, with what is new or clutter, and `even`'s orders."""
+    density = density + added(jnp.where(match == NEW, new[:, None], 0.0))
+    if config.clutter:
+        density = density + added(jnp.where(match == CLUTTER, clutter, 0.0))
+    if config.even:
+        density = density - _orders(count, (match >= 0).sum(0))
+    return density
 
 
 def _orders(count, matched):

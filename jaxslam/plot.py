@@ -305,7 +305,7 @@ def _draw_ancestors(axes, distinct, seconds, particles):
     axes.step(before, distinct, color=ANCESTRAL, lw=1.6, where="mid", label="distinct ancestors")
     lone = np.flatnonzero(distinct == 1)
     if lone.size:
-        span = before[lone[-1]], before[0]
+        span = before[lone[-1]], before[lone[0]]  # what came before was redrawn, if anything
         axes.axvspan(*span, color=PLAN, alpha=0.25, lw=0, label="all particles share one past")
     axes.set(xscale="log", yscale="log", ylim=(0.8, particles * 1.3), ylabel="ancestors")
     axes.set_xlabel("time before the end [s]")

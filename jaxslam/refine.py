@@ -13,7 +13,8 @@ import numpy as np
 
 from jaxslam import bundle, chain, regroup
 
-ROUNDS = 10
+ROUNDS, ROUNDS_AGAIN = 10, 3
+MISTAKEN = 1e-4  # probability, at least, that a measurement was taken for the wrong landmark
 TRIES = 3  # times that a landmark may enter the map
 WIDE, WIDER, NARROW = (8.0, 4.0, 2.0, 1.0), (4.0, 2.0, 1.0), (1.0,)  # kernels: `bundle.fit`
 
@@ -46,6 +47,18 @@ class Refined(NamedTuple):
     residual: float
 
 
+class Solved(NamedTuple):
+    """`bundle.Fit` of the last round and the `regroup.Groups` it is of; `merged`: pairs of labels,
+    a landmark and what it was merged with; `converged` as in `Refined`."""
+
+    fit: bundle.Fit
+    groups: regroup.Groups
+    merged: list
+    rounds: int
+    iterations: int
+    converged: bool
+
+
 def refine(frames, pose, birth, start_pose, start_cov, params, sensor, known=False, progress=None):
     """`Refined` of one lineage: `pose` [T, 3] and `birth` [T, K] (as `filter.Info.birth`).
 
@@ -56,13 +69,19 @@ def refine(frames, pose, birth, start_pose, start_cov, params, sensor, known=Fal
     shape = np.shape(frames.measurements.valid)
     _check("pose", pose, (shape[0], 3))
     _check("birth", birth, shape)
+    identity = np.asarray(frames.measurements.identity).ravel()
     with jax.enable_x64(True):
+        params = params if known else doubtful(params)
         given, place = bundle.problem(frames, start_pose, start_cov, params, sensor)
-        name = frames.measurements.identity if known else birth
-        groups = _groups(np.asarray(name).ravel()[place], place, known)
-        path = np.vstack([given.start, pose]).astype(float)
-        fit, groups, counts = _rounds(given, path, groups, known, progress)
-    return _refined(frames, given, fit, groups, place, counts, known)
+        name = identity[place] if known else np.asarray(birth).ravel()[place]
+        found = solved(given, place, pose, name, known, progress=progress)
+    return _refined(found, given, place, shape, identity if known else None)
+
+
+def doubtful(params):
+    """The parameters where identities are hidden: a measurement may be of something else, even of a
+    sensor that has no clutter."""
+    return params._replace(outlier=max(float(params.outlier), MISTAKEN))
 
 
 def _check(name, value, shape):
@@ -83,9 +102,17 @@ def _groups(name, place, known):
     return regroup.Groups(group, label, np.full((len(label), 2), np.nan))
 
 
-def _rounds(given, path, groups, known, progress):
-    """Solve and check again until nothing changes: `Fit`, the `Groups` solved for, and counts."""
-    widths, done, iterations, merged = WIDE, 0, 0, 0
+def solved(given, place, pose, name, known, again=False, progress=None):
+    """Solve and check again until nothing changes: `Solved`.
+
+    `place` [M]: of the measurements, as `bundle.problem` has it; `pose` [T, 3]; `name` [M]: their
+    identities if they are `known`, else their landmarks' births. `again`: most of it was refined
+    before and will be again, so fewer rounds will do, and landmarks may yet earn their place.
+    """
+    widths, most = (NARROW, ROUNDS_AGAIN) if again else (WIDE, ROUNDS)
+    groups = _groups(name, place, known)
+    path = np.vstack([given.start, pose]).astype(float)
+    done, iterations, merged = 0, 0, []
     tries = np.full(len(groups.label), TRIES)
     groups = _located(given, path, groups, tries)
     while True:
@@ -93,16 +120,16 @@ def _rounds(given, path, groups, known, progress):
         fit = bundle.fit(given, path, groups.point[rows], which, widths, progress)
         path, done, iterations = fit.path, done + 1, iterations + fit.iterations
         groups.point[rows] = fit.points
-        after, count = regroup.checked(given, fit, groups, known)
+        after, pairs = regroup.checked(given, fit, groups, known, not again)
         after = _located(given, path, after, tries)
         settled = np.array_equal(after.of, groups.of) and np.array_equal(
             np.isfinite(after.point), np.isfinite(groups.point)
         )
-        if settled or done == ROUNDS:
-            counts = dict(rounds=done, iterations=iterations, merged=merged)
-            return fit, groups, counts | {"converged": settled and fit.converged}
-        merged += count
-        widths = WIDER if count else NARROW
+        if settled or done == most:
+            converged = bool(settled and fit.converged)
+            return Solved(fit, groups, merged, done, iterations, converged)
+        merged += pairs
+        widths = WIDER if pairs else NARROW
         groups = after
 
 
@@ -115,8 +142,21 @@ def _located(given, path, groups, tries):
     return after._replace(point=np.where((new & (tries < 0))[:, None], np.nan, after.point))
 
 
-def _refined(frames, given, fit, groups, place, counts, known):
+def matches(found, place, shape):
+    """What each measurement was taken for [T, K] (`shape`), as `Result.match`; where the landmark
+    has no depth yet, its label all the same."""
+    groups = found.groups
+    _, which = regroup.inside(groups)
+    used = (groups.of >= 0) & ((which < 0) | (found.fit.weight > 0.5))
+    label = np.where(used, np.append(groups.label, -2)[groups.of], -2)
+    match = np.full(shape, -3).ravel()
+    match[place] = np.where(label == place, -1, label)
+    return match.reshape(shape)
+
+
+def _refined(found, given, place, shape, identities):
     """`Refined` from the last round; points without an inlier or a depth are left out."""
+    fit, groups = found.fit, found.groups
     rows, which = regroup.inside(groups)
     sure = fit.weight > 0.5
     n = np.bincount(which[sure], minlength=len(rows))
@@ -127,12 +167,8 @@ def _refined(frames, given, fit, groups, place, counts, known):
     every = np.arange(len(rows))
     own = cov[every, :, every][kept]
     identity = np.full(len(groups.label), -1)
-    if known:
-        identity = np.asarray(frames.measurements.identity).ravel()[groups.label]
-    used = (groups.of >= 0) & ((which < 0) | sure)
-    label = np.where(used, np.append(groups.label, -2)[groups.of], -2)
-    match = np.full(frames.measurements.valid.size, -3)
-    match[place] = np.where(label == place, -1, label)
+    if identities is not None:
+        identity = identities[groups.label]
     pose = fit.path[1:].copy()
     pose[:, 2] = (pose[:, 2] + np.pi) % (2 * np.pi) - np.pi
     return Refined(
@@ -143,9 +179,12 @@ def _refined(frames, given, fit, groups, place, counts, known):
         landmark_cov=np.stack([own[:, 0, 0], own[:, 0, 1], own[:, 1, 1]], 1),
         n=n[kept],
         identity=identity[rows][kept],
-        match=match.reshape(frames.measurements.valid.shape),
+        match=matches(found, place, shape),
+        rounds=found.rounds,
+        iterations=found.iterations,
         cost=fit.cost,
-        dropped=len(groups.label) - counts["merged"] - int(kept.sum()),
+        converged=found.converged,
+        merged=len(found.merged),
+        dropped=len(groups.label) - len(found.merged) - int(kept.sum()),
         residual=fit.residual,
-        **counts,
     )

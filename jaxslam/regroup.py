@@ -16,6 +16,7 @@ NEAR = 0.5  # m between two halves of one landmark, at most
 TOGETHER = 0.02  # of the frames of the rarer half of one landmark, how many may show both
 UNRIPE = 3.0  # standard deviations of its position by which a bearing-only landmark is away
 SWEEPS = 10  # of reweighting, in triangulation
+BEYOND = 1.5  # of the declared view, as far as a landmark may be measured: depths err
 CAUCHY = 4.0  # standard deviations beyond which a bearing's weight in triangulation falls
 
 
@@ -47,27 +48,33 @@ def located(given, path, groups):
     return groups._replace(point=np.where(missing[:, None], point, groups.point))
 
 
-def checked(given, fit, groups, known):
-    """The groups after a look at the refined map, and how many were merged.
+def checked(given, fit, groups, known, confirmed=True):
+    """The groups after a look at the refined map, and the pairs of labels that were merged: of the
+    one that is no more, and of what it is now.
 
-    Known identities only lose landmarks whose depth is open.
+    Known identities only lose landmarks whose depth is open. `confirmed`: landmarks must have been
+    seen as often as those of a final map; else more often than not.
     """
     rows, which = inside(groups)
     keep = np.ones(len(rows), bool)
-    merged = 0
+    merged = []
     if not known:
-        seen = _seen(given, fit, which)
+        seen = frames_seen(given, fit, which)
         into = _alike(given, fit, which, seen)
-        merged = int(np.sum(into != np.arange(len(rows))))
+        less = np.flatnonzero(into != np.arange(len(rows)))
+        pairs = groups.label[rows[less]], groups.label[rows[into[less]]]
+        merged = [(int(a), int(b)) for a, b in zip(*pairs, strict=True)]
         if merged:  # their points are of one half each: solve before anything is judged by them
             which = np.where(which >= 0, into[which], -1)
             keep = into == np.arange(len(rows))
         else:
-            keep = _exists(given, fit, seen)
+            keep = existence(given, fit, seen) >= (
+                given.params.existence_confirm if confirmed else 0
+            )
             which = np.where(groups.of == -1, -1, which)
             which = _chosen(given, fit, which, keep, free=(which >= 0) | (groups.of == -1))
     if given.sensor == "bearing":
-        keep &= ripe(given, fit, which) | (merged > 0)
+        keep &= ripe(given, fit, which) | bool(merged)
     waiting = (groups.of >= 0) & (inside(groups)[1] < 0)
     point = groups.point.copy()
     point[rows[~keep]] = np.nan
@@ -143,7 +150,7 @@ def _from_bearings(given, place, groups):
     return np.where(good[:, None], point, np.nan)
 
 
-def _seen(given, fit, which):
+def frames_seen(given, fit, which):
     """In which frames [T, L] each point was measured."""
     sure = fit.weight > 0.5
     seen = np.zeros((len(fit.path) - 1, len(fit.points)), bool)
@@ -182,8 +189,8 @@ def _alike(given, fit, which, seen):
     return into
 
 
-def _exists(given, fit, seen):
-    """Which points [L] are confirmed over the whole log, by the filter's log-odds of existence."""
+def existence(given, fit, seen):
+    """The filter's log-odds of existence [L] of the points, over the whole path."""
     p = given.params
     x, y, heading = bundle.sensor_poses(fit.path[1:], p).T
     dx, dy = fit.points[:, 0] - x[:, None], fit.points[:, 1] - y[:, None]
@@ -192,22 +199,24 @@ def _exists(given, fit, seen):
     visible = (bearing >= p.view_min) & (bearing <= p.view_max) & ~seen
     chance = p.detection * np.maximum(0, 1 - np.hypot(dx, dy) / p.view_range)
     missed = np.sum(np.where(visible, np.log1p(-np.minimum(chance, 0.999)), 0), 0)
-    odds = p.existence_new + p.existence_seen * (seen.sum(0) - 1) + p.existence_miss * missed
-    return odds >= p.existence_confirm
+    return p.existence_new + p.existence_seen * (seen.sum(0) - 1) + p.existence_miss * missed
 
 
 def _chosen(given, fit, which, keep, free):
     """The points [M] that the measurements choose (-1: clutter), best pair of a frame first.
 
-    A point is measured once in a frame. Measurements that are not `free` keep what they have.
+    A point is measured once in a frame, and not from far beyond the declared view: near-parallel
+    rays would else make a point at any distance of what clutter is left. Measurements that are not
+    `free` keep what they have.
     """
     with np.errstate(divide="ignore"):
         clutter = float(sensors.log_clutter_density(given.sensor, given.params))
-    pairs = []
+    pairs, place = [], _places(given, fit.path)[:, :2]
     for i in np.flatnonzero(keep):
         density = bundle.log_inlier(given, fit.path, fit.points[i])
         density += STAY * (which == i)
-        good = np.flatnonzero(free & (density > clutter))
+        near = np.hypot(*(place - fit.points[i]).T) < BEYOND * given.params.view_range
+        good = np.flatnonzero(free & near & (density > clutter))
         pairs.append((good, np.full(len(good), i), density[good]))
     m, point, density = (np.concatenate(part) for part in zip(*pairs, strict=True)) if pairs else (
         np.zeros(0, int), np.zeros(0, int), np.zeros(0))  # fmt: skip

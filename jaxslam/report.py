@@ -1,12 +1,13 @@
 """A run's folder: written whole or not at all, and read back.
 
+A long run's folder (`offline`) is there from its beginning; `summary.json` is the last to appear.
+
 `run.toml` reruns it, `summary.json` sums it up, `events.jsonl` says when something happened,
 `steps.npz` holds every column of the result. For other tools: `trajectory.tum` and `landmarks.csv`
 are the filter's, as it knew them at the time and at the end; `trajectory_refined.tum` and
 `landmarks_refined.csv` are what was refined afterwards, and are not there if nothing was.
 """
 
-import errno
 import json
 import os
 import shutil
@@ -21,10 +22,11 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from jaxslam import plot
-from jaxslam.atomic import beside, move_folder, sync
+from jaxslam import lock, plot
+from jaxslam.atomic import NO_SPACE, beside, move_folder, sync
 from jaxslam.config import Config, Params
 from jaxslam.evaluate import errors
+from jaxslam.events import ambiguous, events
 from jaxslam.log import BUNDLED, load_log, save_log
 
 COLUMNS = (
@@ -32,6 +34,10 @@ COLUMNS = (
     *("log_evidence", "nonfinite", "degenerate", "match", "row", "dead_reckoning"),
 )
 NEEDED = ("run.toml", "summary.json", "steps.npz")  # without these it is no run's folder
+FINISHED = "summary.json"
+CHECKPOINTS, PARTIAL = "checkpoints", ".results"
+WORKING = (lock.NAME, CHECKPOINTS, PARTIAL)  # what only an unfinished run's folder holds
+MAYBE = ("entropy", "events")  # columns that not every run has
 LOOKING_BACK = ("ancestral", "lineage", "refined")  # columns of what a run need not have
 FILES = (
     *(*NEEDED, "trajectory.tum", "landmarks.csv", "events.jsonl", "log.npz", *plot.FIGURES),
@@ -40,7 +46,7 @@ FILES = (
 
 
 def save(result, directory, overwrite=False, log_source=None, figures=True):
-    """Write a run's folder; all of it appears at once, or nothing does. The figures come after.
+    """Write a run's folder; all of it appears at once, or nothing does.
 
     `log_source`: the path or name the log was loaded from, for reruns; without one the log itself
     is stored beside the results. Raises `ValueError` for a folder that exists (unless `overwrite`
@@ -56,41 +62,81 @@ def save(result, directory, overwrite=False, log_source=None, figures=True):
     except OSError as error:
         raise _unwritable(directory, error) from error
     try:
-        _write_files(result, partial, _source(log_source, target))
-        sync(*partial.iterdir(), partial)
+        _write_files(result, partial, _source(log_source, target), figures)
         move_folder(partial, target, overwrite)
     except OSError as error:
-        if error.errno == errno.ENOSPC:
-            raise
         raise _unwritable(directory, error) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    if figures:
-        plot.plot(result, directory)
 
 
-def check_target(directory, overwrite=False):
-    """Raise `ValueError` if a run's folder can't be written here; to be asked before a long run."""
+def finish(result, directory, log_source=None):
+    """Write the results of a long run into its folder: `save` for a folder that is there.
+
+    Dying before `summary.json`, the last, is there leaves it unfinished. Raises `OSError` where
+    there is no space.
+    """
+    directory = Path(directory)
+    partial = directory / PARTIAL
+    clear_results(directory)
+    try:
+        partial.mkdir()
+        _write_files(result, partial, _source(log_source, directory.resolve()))
+        for path in sorted(partial.iterdir(), key=lambda path: path.name == FINISHED):
+            if path.name == FINISHED:
+                sync(directory)
+            os.replace(path, directory / path.name)
+        sync(directory)
+    except OSError as error:
+        raise _unwritable(directory, error) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def clear_results(directory):
+    """Remove a run's results, whole or in part; first the file that says they are whole."""
+    shutil.rmtree(directory / PARTIAL, ignore_errors=True)
+    for name in (FINISHED, *FILES):
+        (directory / name).unlink(missing_ok=True)
+
+
+def check_target(directory, overwrite=False, resume=False):
+    """Raise `ValueError` if a run's folder can't be written here; to be asked before a long run.
+
+    `resume`: there may be an unfinished run, or a finished one. Raises `BlockingIOError` if another
+    process is writing there.
+    """
     directory = Path(directory)
     try:
         if directory.exists() or directory.is_symlink():
-            _check_existing(directory, overwrite)
+            lock.check(directory)
+            _check_existing(directory, overwrite, resume)
         parent = next(path for path in directory.resolve().parents if path.exists())
         if not parent.is_dir() or not os.access(parent, os.W_OK):
             raise ValueError(f"{directory}: can't be made in {parent}; choose another with --out")
+    except BlockingIOError:
+        raise
     except OSError as error:
         raise _unwritable(directory, error) from error
 
 
-def _check_existing(directory, overwrite):
+def _check_existing(directory, overwrite, resume):
     if not directory.is_dir():
         raise ValueError(f"{directory}: is not a folder; choose another with --out")
+    names = {path.name for path in directory.iterdir()}
+    unfinished = FINISHED not in names and not names.isdisjoint(WORKING)
+    a_runs = unfinished or not names or names.issuperset(NEEDED)
+    if resume and a_runs:
+        return
+    if resume:
+        raise ValueError(f"{directory}: is not a run's folder, so there is nothing to go on with")
+    if unfinished and not overwrite:
+        raise ValueError(f"{directory}: a run is unfinished; add --resume, or --overwrite")
     if not overwrite:
         raise ValueError(f"{directory}: exists; choose another folder or add --overwrite")
-    names = {path.name for path in directory.iterdir()}
-    if names and not names.issuperset(NEEDED):
+    if not a_runs:
         raise ValueError(f"{directory}: is not a run's folder, so it is not overwritten")
-    if strange := sorted(names - set(FILES)):
+    if strange := sorted(names - {*FILES, *WORKING}):
         raise ValueError(f"{directory}: holds {strange[0]}, not of a run, so it is not overwritten")
 
 
@@ -113,6 +159,7 @@ def load(directory, log=None):
             columns = {name: steps[name] for name in COLUMNS}
             landmarks = MapEstimate(**_part("map", steps))
             columns |= _looking_back(steps)
+            columns |= {name: steps[name] for name in MAYBE if name in steps.files}
         seed, source = told["seed"], told["log"]
         spent = {name: summary[name] for name in ("seconds", "compile_seconds", "dropped")}
         spent["refine_seconds"] = summary.get("refine_seconds")
@@ -181,6 +228,7 @@ def summarise(result):
         "overflow": float(np.sum(result.overflow)),
         "dropped_measurements": int(sum(result.dropped.values())),
         "dropped": dict(result.dropped),
+        "ambiguous_measurements": len(ambiguous(result)),
         "warnings": list(result.flags),
         "advice": list(result.advice),
         **_looked_back(result),
@@ -236,21 +284,6 @@ def landmark_lines(landmarks):
         yield f"{int(who)},{numbers},{int(n)}\n"
 
 
-def event_lines(result):
-    """One JSON line per frame in which something happened; `t` in seconds since the first frame."""
-    happened = result.resampled | (result.new > 0) | (result.overflow > 0) | result.degenerate
-    happened = happened | (result.nonfinite > 0) | (result.forgotten >= 0.5)
-    for step in np.flatnonzero(happened).tolist():
-        event = {"step": step, "t": int(result.time[step] - result.time[0]) / 1e9}
-        event["ess"] = round(float(result.ess[step]), 1)
-        for name in ("resampled", "degenerate"):
-            event |= {name: True} if getattr(result, name)[step] else {}
-        for name in ("new", "overflow", "nonfinite", "forgotten"):
-            count = float(getattr(result, name)[step])
-            event |= {name: round(count, 3)} if count else {}
-        yield _json(event) + "\n"
-
-
 def run_toml(result, log):
     """The text of `run.toml`: what the run was told, every value resolved."""
     lines = [
@@ -263,7 +296,8 @@ def run_toml(result, log):
     return "\n".join(lines) + "\n"
 
 
-def _write_files(result, folder, source):
+def _write_files(result, folder, source, figures=True):
+    """Write all files of a run into a folder, and see them onto the disk."""
     if source is None:
         save_log(folder / "log.npz", result.log)
         source = "log.npz"
@@ -272,12 +306,14 @@ def _write_files(result, folder, source):
     for name, table in tables.items():
         if table is not None:
             columns |= {f"{name}_{key}": np.asarray(v) for key, v in table._asdict().items()}
+    maybe = {name: getattr(result, name) for name in MAYBE}
+    columns |= {name: value for name, value in maybe.items() if value is not None}
     np.savez_compressed(folder / "steps.npz", **columns)
     files = {
         "run.toml": [run_toml(result, source)],
         "trajectory.tum": tum_lines(result.time, result.pose),
         "landmarks.csv": landmark_lines(result.landmarks),
-        "events.jsonl": event_lines(result),
+        "events.jsonl": (_json(event) + "\n" for event in events(result)),
         "summary.json": [_json(summarise(result), indent=2) + "\n"],
     }
     if result.refined is not None:
@@ -286,6 +322,9 @@ def _write_files(result, folder, source):
     for name, lines in files.items():
         with open(folder / name, "w", encoding="utf-8", newline="\n") as file:
             file.writelines(lines)
+    if figures:
+        plot.plot(result, folder)
+    sync(*folder.iterdir(), folder)
 
 
 def _source(log_source, target):
@@ -305,6 +344,9 @@ def _find_log(directory, source):
 
 
 def _unwritable(directory, error):
+    """The error to raise instead."""
+    if error.errno in NO_SPACE:
+        return OSError(error.errno, error.strerror, str(directory))
     return ValueError(
         f"{directory}: can't be written ({error.strerror}); choose another with --out"
     )

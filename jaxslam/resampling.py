@@ -3,6 +3,8 @@
 import jax
 import jax.numpy as jnp
 
+from jaxslam import devices
+
 AT_ONCE = 4096  # elements: a round of a loop costs as much as some hundred of them
 
 
@@ -28,17 +30,19 @@ def systematic(log_weight, uniform):
     return jnp.maximum(last[chosen], first)
 
 
-def gather(tree, ancestors, wanted):
+def gather(tree, ancestors, wanted, config):
     """Every leaf [..., N] with its last axis taken at `ancestors`, if `wanted`.
 
     A few rows at a time and in place: they fit the cache, while a whole `take` would need a second
     copy of the map and run at a fraction of the speed. Unwanted is a loop of no rounds, where a
-    `cond` would copy the map.
+    `cond` would copy the map. A device has its share of the leaves.
     """
+    ancestors = devices.mine(ancestors, config)
 
     def one(i, parts):
         part = jax.lax.dynamic_index_in_dim(parts, i, keepdims=False)
-        return jax.lax.dynamic_update_index_in_dim(parts, part[:, ancestors], i, 0)
+        (part,) = devices.taken([part], [ancestors], config)
+        return jax.lax.dynamic_update_index_in_dim(parts, part, i, 0)
 
     def gather_leaf(leaf):
         if leaf.size == 0:

@@ -8,11 +8,13 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxslam import motion, sensors
 from jaxslam.geometry import wrap
 
 LEAST_VARIANCE = 1e-12  # m^2, rad^2, of noise that is declared to be none
+FEWEST = 1024  # intervals or measurements that one compilation serves, at least
 
 
 def _motion(before, after, odometry, params):
@@ -53,38 +55,71 @@ def _innovation(sensor, pose, point, value, scale, params):
     return jnp.stack([first * scale[0], (second - scale[2] * first) * scale[1]])
 
 
-@jax.jit
 def motions(before, after, odometry, params):
     """Residuals [T, 3] of all intervals."""
+    return _each(_motions, (before, after, odometry), params)
+
+
+def motion_jacobian(before, after, odometry, params):
+    """The same, with their derivatives [T, 3, 3] by the poses before and after."""
+    return _each(_motion_jacobian, (before, after, odometry), params)
+
+
+def scales(sensor, pose, point, cov, params):
+    """What whitens all measurements [M, 3], from poses [M, 3] and points [M, 2]."""
+    return _each(_scales, (pose, point, cov), params, sensor)
+
+
+def innovations(sensor, pose, point, value, scales, params):
+    """Whitened innovations [M, 1 or 2] of all measurements."""
+    return _each(_innovations, (pose, point, value, scales), params, sensor)
+
+
+def jacobian(sensor, pose, point, value, scales, params):
+    """The same, with their derivatives [M, 1 or 2, 3] by pose and [M, 1 or 2, 2] by point."""
+    return _each(_jacobian, (pose, point, value, scales), params, sensor)
+
+
+def _each(function, arrays, *rest):
+    """The function of arrays [n, ...]; it is compiled for few n only, in between they are filled
+    up: a log that grows would have it compiled time and again."""
+    n = len(jax.tree.leaves(arrays)[0])
+    size = max(FEWEST, 1 << (n - 1).bit_length()) if n else FEWEST
+
+    def filled(leaf):
+        return np.concatenate([leaf, np.ones((size - n, *np.shape(leaf)[1:]))])
+
+    found = function(*jax.tree.map(filled, arrays), *rest)
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[:n], found)
+
+
+@jax.jit
+def _motions(before, after, odometry, params):
     return jax.vmap(_motion, (0, 0, 0, None))(before, after, odometry, params)
 
 
 @jax.jit
-def motion_jacobian(before, after, odometry, params):
-    """The same, with their derivatives [T, 3, 3] by the poses before and after."""
+def _motion_jacobian(before, after, odometry, params):
     derivative = jax.vmap(jax.jacfwd(_motion, (0, 1)), (0, 0, 0, None))
-    rest = motions(before, after, odometry, params)
+    rest = _motions(before, after, odometry, params)
     return rest, *derivative(before, after, odometry, params)
 
 
 @partial(jax.jit, static_argnames="sensor")
-def scales(sensor, pose, point, cov, params):
-    """What whitens all measurements [3, M], from poses [M, 3] and points [M, 2]."""
+def _scales(pose, point, cov, params, sensor):
     one = partial(_scale, sensor)
-    return jnp.stack(jax.vmap(one, (0, 0, 0, None))(pose, point, cov, params))
+    return jnp.stack(jax.vmap(one, (0, 0, 0, None))(pose, point, cov, params), 1)
 
 
 @partial(jax.jit, static_argnames="sensor")
-def innovations(sensor, pose, point, value, scales, params):
-    """Whitened innovations [M, 1 or 2] of all measurements."""
+def _innovations(pose, point, value, scales, params, sensor):
     one = partial(_innovation, sensor)
-    return jax.vmap(one, (0, 0, 0, 1, None))(pose, point, value, scales, params)
+    return jax.vmap(one, (0, 0, 0, 0, None))(pose, point, value, scales, params)
 
 
 @partial(jax.jit, static_argnames="sensor")
-def jacobian(sensor, pose, point, value, scales, params):
-    """The same, with their derivatives [M, 1 or 2, 3] by pose and [M, 1 or 2, 2] by point."""
+def _jacobian(pose, point, value, scales, params, sensor):
     one = partial(_innovation, sensor)
-    derivative = jax.vmap(jax.jacfwd(one, (0, 1)), (0, 0, 0, 1, None))
-    rest = innovations(sensor, pose, point, value, scales, params)
+    derivative = jax.vmap(jax.jacfwd(one, (0, 1)), (0, 0, 0, 0, None))
+    rest = _innovations(pose, point, value, scales, params, sensor)
     return rest, *derivative(pose, point, value, scales, params)

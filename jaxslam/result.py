@@ -7,11 +7,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jaxslam.config import Config, Params
+from jaxslam.events import FAILED
 from jaxslam.log import NOT_USED, Log
 from jaxslam.smoothing import Ancestral, Lineage
 
 if TYPE_CHECKING:
     from jaxslam.refine import Refined
+
+
+FEWEST, UNLIKELY, WARPED = 3, 9.2, 0.1  # landmarks; chi-square of 2 (99 %); m
 
 
 class MapEstimate(NamedTuple):
@@ -41,6 +45,9 @@ class Result:
     What looks back: `ancestral`: the posterior over the whole path, `lineage`: the past of the
     particle that was best at the end (both None if the genealogy took too much memory), and
     `refined`: that past and its map by least squares, in `refine_seconds` (None: not refined).
+    `entropy` [T, K], nats: how much particles differed about what each measurement is of
+    (`ambiguity`). `events` [E, 4]: what rejuvenation did to the map (`rejuvenation.Past`; None:
+    there was none).
     """
 
     log: Log
@@ -70,6 +77,8 @@ class Result:
     lineage: Lineage | None = None
     refined: "Refined | None" = None
     refine_seconds: float | None = None
+    events: np.ndarray | None = None
+    entropy: np.ndarray | None = None
 
     @property
     def landmarks_refined(self):
@@ -111,6 +120,38 @@ class Result:
     @cached_property
     def advice(self):
         """One line for everything that is no fault but should be known."""
+        return self._shared_past + self._failed + self._warped
+
+    @property
+    def _failed(self):
+        """A line if a past could not be refined on the way."""
+        failed = 0 if self.events is None else int(np.sum(self.events[:, 1] == FAILED))
+        if not failed:
+            return []
+        return [f"the past could not be refined {failed} times; the filter went on without"]
+
+    @property
+    def _warped(self):
+        """A line if the filter's map and the refined one, of the same landmarks, disagree."""
+        if self.refined is None:
+            return []
+        mine, other = self.landmarks, self.landmarks_refined
+        _, i, j = np.intersect1d(mine.id, other.id, return_indices=True)
+        if len(i) < FEWEST:
+            return []
+        off = mine.mean[i] - other.mean[j]
+        xx, xy, yy = (mine.cov[i] + other.cov[j]).T
+        square = yy * off[:, 0] ** 2 - 2 * xy * off[:, 0] * off[:, 1] + xx * off[:, 1] ** 2
+        square, distance = np.median(square / (xx * yy - xy**2)), np.median(np.hypot(*off.T))
+        if square < UNLIKELY or distance < WARPED:
+            return []
+        return [
+            f"the filter's map and the refined one differ by {distance:.2f} m in the median, "
+            f"{np.sqrt(square):.1f} standard deviations: one of them is likely warped"
+        ]
+
+    @property
+    def _shared_past(self):
         if self.ancestral is None:
             return [
                 "the particles' genealogy took too much memory: only the filter's path is there"

@@ -174,6 +174,18 @@ def log_new_density(sensor, value, params):
     return jnp.log1p(-params.outlier) + jnp.log(params.density_new * area)
 
 
+def at_most_one_new(params):
+    """The parameters for telling hidden identities apart by bearings alone: no more than one new
+    landmark a frame is expected.
+
+    A bearing has no place. `density_new` over the whole view counts the landmarks that are in the
+    map already, so that where they are dense everything would be new.
+    """
+    width = params.view_max - params.view_min
+    most = 2 / (width * params.view_range**2)
+    return params._replace(density_new=jnp.minimum(params.density_new, most))
+
+
 def log_clutter_density(sensor, params):
     """log density of measurements of nothing: uniform over the view, with probability `outlier`."""
     width = params.view_max - params.view_min

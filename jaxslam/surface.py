@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from jaxslam import learn, likelihood, scale
+from jaxslam import devices, learn, likelihood, scale
 from jaxslam.config import UNITS, Params
 from jaxslam.learn_report import KNOWN, fit_axis, values_of
 from jaxslam.plot import LANDMARK, RECKONING, STYLE, ellipses
@@ -80,7 +80,7 @@ def _values(free, params, data, which, keys, config, names):
         mine = jax.tree.map(lambda leaf: leaf[log], data)
         return likelihood.value(scale.put(params, names, at), mine, key, config)
 
-    return learn.spread(one, (free, which, keys))
+    return devices.spread(one, (free, which, keys), len(jax.devices()))
 
 
 def draw_surface(found, fit, errors):

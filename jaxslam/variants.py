@@ -53,8 +53,8 @@ def _rules(config):
     sizes = config.particles, config.landmarks, config.measurements
     return {
         "Config.paper()": Config.paper(*sizes, sensor=sensor, association=config.association),
-        "FastSLAM 1.0": replace(config, proposal="prior"),
-        "informed": replace(config, proposal="informed"),
+        "FastSLAM 1.0": replace(config, proposal="prior", rejuvenate=0.0),
+        "informed": replace(config, proposal="informed", rejuvenate=0.0),
     }
 
 

@@ -1,5 +1,7 @@
 """Shared by all tests."""
 
+import os
+import tempfile
 from pathlib import Path
 
 import jax
@@ -8,6 +10,17 @@ import pytest
 from jaxslam import cli
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+def pytest_configure(config):
+    """Each program is compiled once, for all workers and all processes that tests start."""
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # a worker inherits it
+        place = tempfile.TemporaryDirectory(prefix="jaxslam-compiled-", ignore_cleanup_errors=True)
+        config.add_cleanup(place.cleanup)
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = place.name
+        jax.config.update("jax_compilation_cache_dir", place.name)
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ SENSING |= {"sigma_bearing": 0.05, "caution": 0.0}
 
 
 def make_model(config=None, **changes):
-    rules = {"sensor": "range_bearing", "clutter": True} | (config or {})
+    rules = {"sensor": "range_bearing", "clutter": True, "association": "known"} | (config or {})
     params = SimpleNamespace(**MOTION | SENSING | changes)
     return baseline.make_model(params, SimpleNamespace(**rules))
 
@@ -121,6 +121,12 @@ def test_best_match_may_share_and_the_rest_is_new_or_clutter():
     shared = baseline.associate_likeliest(table, new, clutter, False)
     assert shared == [0, 0, baseline.NEW, baseline.CLUTTER, baseline.NEW]
     assert baseline.associate_likeliest(table, new, clutter, True)[:2] == [1, 0]
+
+
+def test_of_hidden_bearings_one_a_frame_is_expected_to_be_new():
+    model = make_model({"sensor": "bearing", "association": "maximum_likelihood"})
+    new, _ = baseline.alternatives(SimpleNamespace(value=np.array([3.0, 0.5])), model)
+    assert new == pytest.approx(math.log(0.98 / 4.0))
 
 
 @pytest.mark.parametrize("sensor", ["position", "range_bearing", "bearing"])

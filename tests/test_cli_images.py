@@ -10,7 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from test_cli import outside
+from test_cli_help import outside
 from test_images import png
 from test_points import normal, straight
 

@@ -126,7 +126,7 @@ def test_the_baselines_map_is_what_its_best_particle_is_sure_of():
 
 def test_variants_stand_side_by_side():
     log = simulate.planar("field", 5, landmarks=15, length_m=12.0, rate_hz=2.0)
-    config = Config(particles=30, measurements=8, landmarks=24)
+    config = Config(particles=30, measurements=10, landmarks=30)  # test_offline's: compiled once
     pose, marks = log.truth.pose[:40] + [0.25, 0, 0], log.truth.landmarks[:9]
     world = compare.PointMap(marks + [0.25, 0.1], np.full(9, -1))
     zeros = [0.0] * 4

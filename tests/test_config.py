@@ -33,7 +33,7 @@ def make_log(**changes):
 def settings(config):
     """All but what decides the speed alone."""
     values = dataclasses.asdict(config)
-    return {k: v for k, v in values.items() if k not in ("block", "lazy", "chains")}
+    return {k: v for k, v in values.items() if k not in ("block", "lazy", "chains", "devices")}
 
 
 def test_defaults():
@@ -49,7 +49,17 @@ def test_defaults():
         "forgetting": True,
         "proposal": "prior",
         "even": False,
+        "rejuvenate": 0.0,
     }
+
+
+def test_only_hidden_bearings_are_rejuvenated_unasked():
+    assert Config(sensor="bearing").rejuvenate == 3.0
+    assert Config(sensor="bearing", association="known").rejuvenate == 0
+    assert Config(sensor="position", rejuvenate=2).rejuvenate == 2
+    for wrong in (-1, float("inf"), True, "3"):
+        with pytest.raises(ValueError, match=f"Config.rejuvenate: {wrong!r} is not a number"):
+            Config(rejuvenate=wrong)
 
 
 def test_even_is_for_sampled_associations():
@@ -72,6 +82,7 @@ def test_the_papers_preset_field_by_field():
         "forgetting": False,
         "proposal": "prior",
         "even": False,
+        "rejuvenate": 0.0,
     }
     assert Config.paper(particles=10, landmarks=3, measurements=2) == Config(
         sensor="position",

@@ -66,7 +66,8 @@ def _principal(cov):
 
 @pytest.mark.parametrize("sigma", [5e-4, 2e-3, 2e-2, 0.1])
 @pytest.mark.parametrize("prior", [1.0, 30.0, 1000.0])
-def test_square_root_update_in_single_precision_against_double(sigma, prior):
+@pytest.mark.parametrize("at_once", [False, True])
+def test_square_root_update_in_single_precision_against_double(sigma, prior, at_once):
     """A range and a bearing of `sigma` on a landmark known to `prior` m: what float32 keeps."""
     rng = np.random.default_rng(int(prior) + int(1e4 * sigma))
     for _ in range(200):
@@ -87,6 +88,9 @@ def test_square_root_update_in_single_precision_against_double(sigma, prior):
             # Joseph form in double precision
             keep = np.eye(2) - np.outer(gain, h)
             precise = keep @ precise @ keep.T + np.outer(gain, gain) * sigma**2
+        if at_once:
+            given = np.zeros(2, "f"), factor.astype("f"), rows.astype("f"), np.full(2, 0.01, "f")
+            _, small, *_ = geometry.pair_update(*given, np.full(2, sigma, "f") ** 2)
         l11, l21, l22 = np.array(small, float)
         assert l11 > 0
         assert l22 > 0
@@ -111,3 +115,21 @@ def test_scalar_update_is_the_kalman_filter(x64):
         np.testing.assert_allclose(
             geometry.covariance(got), expected[[0, 0, 1], [0, 1, 1]], rtol=1e-8, atol=1e-12
         )
+
+
+def test_two_scalars_at_once_are_one_after_the_other(x64):
+    rng = np.random.default_rng(4)
+    for _ in range(50):
+        mean, factor = rng.normal(size=2), np.array([1, rng.normal(), 1]) * rng.uniform(0.01, 5)
+        rows, innovations = rng.normal(size=(2, 2)), rng.normal(size=2)
+        variances = rng.uniform(1e-4, 1, 2)
+        once, between, s1 = geometry.scalar_update(
+            mean, factor, rows[0], innovations[0], variances[0]
+        )
+        rest = innovations[1] - rows[1] @ (np.array(once) - mean)
+        twice, expected, s2 = geometry.scalar_update(once, between, rows[1], rest, variances[1])
+        got, small, square, log = geometry.pair_update(mean, factor, rows, innovations, variances)
+        np.testing.assert_allclose(got, twice, atol=1e-10)
+        np.testing.assert_allclose(small, expected, atol=1e-10)
+        np.testing.assert_allclose(square, innovations[0] ** 2 / s1 + rest**2 / s2, rtol=1e-9)
+        np.testing.assert_allclose(log, np.log(s1 * s2), atol=1e-9)

@@ -6,255 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
+from landmark_cases import COV, PARAMS, SENSOR_POSE, matrix, padded, predict, world_of
 
 from jaxslam import association, baseline_ekf, births, geometry, landmarks, matched, sensors
 from jaxslam.baseline import make_model
-from jaxslam.config import SENSORS, Config, default_params
+from jaxslam.config import SENSORS, Config
 from jaxslam.sensors import Measurements
-
-PARAMS = default_params()._replace(
-    growth=0.02, position_scale=1.3, mount_x=0.2, mount_yaw=0.1, caution=0.0
-)
-COV = (0.04, -0.015, 0.02)  # of a position: correlated
-SENSOR_POSE = np.array([0.5, -0.3, 0.8])
-
-
-def wrap(angle):
-    return (angle + np.pi) % (2 * np.pi) - np.pi
-
-
-def predict(sensor, mean, anchor):
-    """What the sensor should read, from the geometry."""
-    if sensor == "bearing":
-        point = anchor + np.array([np.cos(mean[0]), np.sin(mean[0])]) / mean[1]
-    else:
-        point = mean
-    dx, dy = point - SENSOR_POSE[:2]
-    r, bearing = np.hypot(dx, dy), wrap(np.arctan2(dy, dx) - SENSOR_POSE[2])
-    if sensor == "position":
-        return r * np.array([np.cos(bearing), np.sin(bearing)]), r
-    return np.array([bearing] if sensor == "bearing" else [r, bearing]), r
-
-
-def jacobian(sensor, mean, anchor, h=1e-6):
-    columns = []
-    for step in h * np.eye(2):
-        ends = [predict(sensor, mean + sign * step, anchor)[0] for sign in (1, -1)]
-        columns.append((ends[0] - ends[1]) / (2 * h))
-    return np.array(columns).T
-
-
-def kalman(sensor, mean, cov, anchor, value):
-    """Textbook EKF in covariance form: mean, covariance, log density of the measurement."""
-    expected, r = predict(sensor, mean, anchor)
-    bearing_var = PARAMS.sigma_bearing**2 + (PARAMS.growth / r) ** 2
-    xx, xy, yy = PARAMS.position_scale**2 * np.array(COV)
-    noise = {
-        "bearing": np.array([[bearing_var]]),
-        "range_bearing": np.diag([PARAMS.sigma_range**2, bearing_var]),
-        "position": np.array([[xx, xy], [xy, yy]]),
-    }[sensor]
-    h = jacobian(sensor, mean, anchor)
-    s = h @ cov @ h.T + noise
-    innovation = value - expected
-    if sensor != "position":
-        innovation[-1] = wrap(innovation[-1])
-    gain = cov @ h.T @ np.linalg.inv(s)
-    after = (np.eye(2) - gain @ h) @ cov
-    density = multivariate_normal(np.zeros(len(s)), s).logpdf(innovation)
-    return mean + gain @ innovation, after, density
-
-
-def case(sensor, seed):
-    """A landmark (mean, lower factor, anchor) and a measurement of it that is some way off."""
-    rng = np.random.default_rng(seed)
-    low, high = ((-3, 0.2), (3, 1.0)) if sensor == "bearing" else ((2, 2), (5, 5))
-    mean, anchor = rng.uniform(low, high), rng.uniform(-1, 1, 2)
-    size = 0.05 if sensor == "bearing" else 0.5
-    factor = size * np.array([rng.uniform(0.5, 2), rng.uniform(-1, 1), rng.uniform(0.5, 2)])
-    value = predict(sensor, mean, anchor)[0] + rng.normal(0, 0.1, 1 if sensor == "bearing" else 2)
-    return mean, factor, anchor, value
-
-
-def matrix(parts):
-    xx, xy, yy = (np.asarray(p) for p in parts)
-    return np.array([[xx, xy], [xy, yy]])
-
-
-def padded(value):
-    return tuple(np.append(value, 0.0)[:2])
-
-
-@pytest.mark.parametrize("sensor", ["position", "range_bearing"])
-@pytest.mark.parametrize("seed", range(4))
-def test_update_is_the_kalman_filter_in_covariance_form(x64, sensor, seed):
-    mean, factor, anchor, value = case(sensor, seed)
-    cov = matrix(geometry.covariance(factor))
-    got, root, density = landmarks.update(
-        sensor, SENSOR_POSE, tuple(mean), tuple(factor), anchor, padded(value), COV, PARAMS
-    )
-    want_mean, want_cov, want_density = kalman(sensor, mean, cov, anchor, value)
-    np.testing.assert_allclose(got, want_mean, atol=1e-8)
-    np.testing.assert_allclose(matrix(geometry.covariance(root)), want_cov, atol=1e-8)
-    assert float(density) == pytest.approx(want_density, abs=1e-6)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_a_well_known_bearing_landmark_is_a_kalman_filter(x64, seed):
-    mean, factor, anchor, value = case("bearing", seed)
-    factor = factor / 100
-    cov = matrix(geometry.covariance(factor))
-    got, root, density = landmarks.update(
-        "bearing", SENSOR_POSE, tuple(mean), tuple(factor), anchor, padded(value), COV, PARAMS
-    )
-    want_mean, want_cov, want_density = kalman("bearing", mean, cov, anchor, value)
-    np.testing.assert_allclose(got - mean, want_mean - mean, rtol=0.02, atol=1e-8)
-    np.testing.assert_allclose(matrix(geometry.covariance(root)), want_cov, rtol=2e-3, atol=1e-11)
-    assert float(density) == pytest.approx(want_density, abs=1e-3)
-
-
-def on_a_grid(first, sigma, growth, values, x, size=200):
-    """Mean and covariance of (direction, inverse depth) given bearings at (x, 0), sensor ahead."""
-    phi = (first + np.linspace(-5, 5, size) * sigma)[:, None]
-    rho = np.linspace(1e-3, PARAMS.inv_depth_mean + 5 * PARAMS.inv_depth_sd, size)[None]
-    log_p = -0.5 * ((phi - first) ** 2 / (sigma**2 + growth**2 * rho**2))
-    log_p = log_p - 0.5 * np.log(sigma**2 + growth**2 * rho**2)
-    log_p = log_p - 0.5 * ((rho - PARAMS.inv_depth_mean) / PARAMS.inv_depth_sd) ** 2
-    for value, at in zip(values, x, strict=True):
-        dx, dy = np.cos(phi) - rho * at, np.sin(phi)
-        variance = sigma**2 + growth**2 * rho**2 / (dx**2 + dy**2)
-        log_p = log_p - 0.5 * wrap(value - np.arctan2(dy, dx)) ** 2 / variance
-        log_p = log_p - 0.5 * np.log(variance)
-    p = np.exp(log_p - log_p.max())
-    p = p / p.sum()
-    mean = np.array([(p * phi).sum(), (p * rho).sum()])
-    d0, d1 = phi - mean[0], rho - mean[1]
-    return mean, [
-        [(p * d0 * d0).sum(), (p * d0 * d1).sum()],
-        [(p * d0 * d1).sum(), (p * d1**2).sum()],
-    ]
-
-
-@pytest.mark.parametrize("ahead", [0.0, 3.0, 10.0, 60.0])
-def test_a_bearing_landmark_stays_with_the_exact_posterior(ahead):
-    """2 m driven past it or towards it, depth drawn from the prior: expected NEES under the exact
-    posterior, which should be 2. One EKF has hundreds straight ahead."""
-    rng, draws, sigma, growth = np.random.default_rng(5), 40, np.deg2rad(4), 0.02
-    params = PARAMS._replace(sigma_bearing=float(sigma), growth=growth)
-    first = np.deg2rad(ahead)
-    rho = np.abs(rng.normal(params.inv_depth_mean, params.inv_depth_sd, draws))
-    phi = first + rng.normal(size=draws) * np.hypot(sigma, growth * rho)
-    x = 0.1 * np.arange(1, 21)
-    dx, dy = np.cos(phi) - rho * x[:, None], np.sin(phi) + 0 * x[:, None]
-    noise = np.sqrt(sigma**2 + growth**2 * rho**2 / (dx**2 + dy**2))
-    values = np.arctan2(dy, dx) + noise * rng.normal(size=dx.shape)
-
-    zero = jnp.zeros(draws)
-    mean, factor, anchor = sensors.locate("bearing", (zero, zero, zero), (first, 0.0), None, params)
-
-    def look(state, seen):
-        at, value = seen
-        pose = (zero + at, zero, zero)
-        after = landmarks.update("bearing", pose, *state, anchor, (value, 0.0), None, params)
-        return after[:2], after[2]
-
-    given = jnp.asarray(x, jnp.float32), jnp.asarray(values, jnp.float32)
-    (mean, factor), _ = jax.jit(lambda s, g: jax.lax.scan(look, s, g))((mean, factor), given)
-    cov = np.moveaxis(matrix(np.asarray(geometry.covariance(factor), float)), -1, 0)
-    nees = []
-    for i in range(draws):
-        exact_mean, exact_cov = on_a_grid(first, sigma, growth, values[:, i], x)
-        off = exact_mean - np.asarray(mean, float)[:, i]
-        nees.append(np.trace(np.linalg.solve(cov[i], exact_cov + np.outer(off, off))))
-    assert 1.0 < np.median(nees) < 3.0
-    assert np.mean(nees) < 10.0
-
-
-@pytest.mark.parametrize("sensor", SENSORS)
-@pytest.mark.parametrize("seed", range(4))
-def test_update_is_the_baselines(x64, sensor, seed):
-    mean, factor, anchor, value = case(sensor, seed)
-    cov = matrix(geometry.covariance(factor))
-    got, root, density = landmarks.update(
-        sensor, SENSOR_POSE, tuple(mean), tuple(factor), anchor, padded(value), COV, PARAMS
-    )
-    other = baseline_ekf.Landmark(mean.copy(), cov.copy(), anchor, 1, 0.0, 0)
-    measured = type("Measured", (), {"value": value, "cov": matrix(COV)})
-    model = make_model(PARAMS, Config(sensor=sensor))
-    expected = baseline_ekf.update(other, measured, SENSOR_POSE, model)
-    np.testing.assert_allclose(got, other.mean, atol=1e-11)
-    np.testing.assert_allclose(matrix(geometry.covariance(root)), other.cov, atol=1e-11)
-    assert float(density) == pytest.approx(expected, abs=1e-9)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_two_whitened_scalars_have_the_joint_density(x64, seed):
-    rng = np.random.default_rng(seed)
-    mean, factor, anchor, value = case("position", seed)
-    spread = rng.normal(size=(2, 2))
-    noise = spread @ spread.T + 0.01 * np.eye(2)  # of any correlation
-    cov = noise[0, 0], noise[0, 1], noise[1, 1]
-    *_, density = landmarks.update(
-        "position", SENSOR_POSE, tuple(mean), tuple(factor), anchor, tuple(value), cov, PARAMS
-    )
-    c, s = np.cos(SENSOR_POSE[2]), np.sin(SENSOR_POSE[2])
-    turn = np.array([[c, s], [-s, c]])
-    prior = turn @ matrix(geometry.covariance(factor)) @ turn.T
-    joint = multivariate_normal(
-        turn @ (mean - SENSOR_POSE[:2]), prior + PARAMS.position_scale**2 * noise
-    )
-    assert float(density) == pytest.approx(joint.logpdf(value), abs=1e-9)
-
-
-def test_bearings_far_behind_never_push_a_landmark_through_infinity(x64):
-    anchor, mean, factor = np.array([0.5, -1.5]), (0.9, 0.01), (0.02, 0.0, 0.5)
-    value = predict("bearing", np.array(mean), anchor)[0]
-    depths = []
-    for off in (-0.5, 0.5):
-        (_, depth), _, _ = landmarks.update(
-            "bearing", SENSOR_POSE, mean, factor, anchor, (value[0] + off, 0.0), COV, PARAMS
-        )
-        depths.append(float(depth))
-    assert min(depths) == sensors.LEAST_INVERSE_DEPTH < max(depths)
-
-
-def test_bearings_across_the_cut_are_close(x64):
-    mean, factor = (
-        (SENSOR_POSE[0] - 3 * np.cos(0.8), SENSOR_POSE[1] - 3 * np.sin(0.8)),
-        (0.1, 0, 0.1),
-    )
-    kept = [
-        landmarks.update(
-            "range_bearing", SENSOR_POSE, mean, factor, None, (3.0, bearing), COV, PARAMS
-        )
-        for bearing in (np.pi - 0.01, -np.pi - 0.01)
-    ]
-    np.testing.assert_allclose(kept[0][0], kept[1][0], atol=1e-9)
-    assert np.hypot(*(np.array(kept[0][0]) - mean)) < 0.1
-
-
-# --- maps of several slots (rows) and particles (columns)
-
-
-def world_of(sensor, count, seed=0, forgetting=True):
-    """A map with landmarks in the slots where `count` [M, N] is not zero."""
-    count = np.asarray(count)
-    slots, particles = count.shape
-    rng = np.random.default_rng(seed)
-    cases = [[case(sensor, rng.integers(1 << 30)) for _ in range(particles)] for _ in range(slots)]
-
-    def stack(i):
-        return jnp.asarray(np.moveaxis([[np.asarray(c[i]) for c in row] for row in cases], -1, 0))
-
-    return landmarks.Landmarks(
-        mean=stack(0),
-        factor=stack(1),
-        anchor=stack(2) if sensor == "bearing" else None,
-        log_odds=jnp.full(count.shape, 2.0) if forgetting else None,
-        count=jnp.asarray(count, jnp.int32),
-        birth=jnp.asarray(rng.integers(0, 100, count.shape), jnp.int32),
-    )
 
 
 def frame_of(sensor, world, match):
@@ -340,6 +97,30 @@ def test_matched_landmarks_are_updated_marked_and_weighed(x64, sensor):
     np.testing.assert_array_equal(got.count, [[-2, 0], [-3, 5], [4, -3]])
     for name in ("birth", "log_odds"):
         np.testing.assert_array_equal(getattr(got, name), getattr(world, name))
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_rows_of_known_identities_are_updated_as_the_map_is(x64, sensor):
+    """Also where a frame names a landmark three times, or one that no map has."""
+    world = world_of(sensor, [[1, 2], [2, 5], [4, 1]])._replace(log_odds=None)
+    match = jnp.array([[1, -1], [1, 1], [0, -2], [-3, -3], [-1, -1], [1, 1]])
+    identity = jnp.array([1, 1, 0, 2, 7, 1])
+    frame = frame_of(sensor, world, match)._replace(identity=identity)
+    rows = matched.rows_of(frame, 3)
+    np.testing.assert_array_equal(rows.slot, [1, 1, 0, 3, 3, 1])
+    np.testing.assert_array_equal(rows.earlier, [0, 1, 0, 0, 0, 2])
+    part = jax.tree.map(lambda leaf: leaf[..., jnp.minimum(rows.slot, 2), :], world)
+    fit = matched.fitted(sensor, poses(2), part, frame, PARAMS)
+    given = rows, match, frame, PARAMS
+    got, density = matched.updated_rows(sensor, poses(2), part, *given, fit)
+    whole, expected = matched.updated(sensor, poses(2), world, match, frame, PARAMS, True)
+    whole = landmarks.settle(whole)
+    for k, slot in ((0, 1), (2, 0)):
+        for name in ("mean", "factor", "count"):
+            row = getattr(got, name)[..., k, :]
+            np.testing.assert_allclose(row, getattr(whole, name)[..., slot, :], atol=1e-12)
+    np.testing.assert_allclose(density, expected, atol=1e-9)
+    np.testing.assert_array_equal(got.count[0], [5, 7])
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
@@ -470,97 +251,6 @@ def test_a_given_map_must_fit():
     world = landmarks.empty(Config(particles=2, landmarks=1), jnp.float32)
     with pytest.raises(ValueError, match="2 landmarks given, but the map has 1 slots"):
         births.given(world, (np.zeros((2, 2)), np.ones((3, 2))))
-
-
-# --- one map for all particles
-
-
-def test_inverse_depth_in_the_world_against_draws(x64):
-    rng = np.random.default_rng(1)
-    mean, factor, anchor = (0.7, 0.4), (0.01, 0.004, 0.012), (1.0, -2.0)
-    world = landmarks.Landmarks(
-        *(jnp.asarray(v)[:, None, None] for v in (mean, factor, anchor)),
-        None, jnp.ones((1, 1), jnp.int32), jnp.zeros((1, 1), jnp.int32),
-    )  # fmt: skip
-    point, cov, known = landmarks.to_world("bearing", world)
-    l11, l21, l22 = factor
-    draws = np.array(mean) + rng.normal(size=(200_000, 2)) @ np.array([[l11, l21], [0, l22]])
-    ray = np.column_stack([np.cos(draws[:, 0]), np.sin(draws[:, 0])])
-    drawn = np.array(anchor) + ray / draws[:, 1:]
-    assert bool(known[0, 0])
-    np.testing.assert_allclose(np.ravel(point), drawn.mean(0), atol=0.01)
-    # To first order: the depth's own 3 % make up for the rest.
-    want = np.cov(drawn.T)
-    np.testing.assert_allclose(matrix(cov)[..., 0, 0], want, atol=0.03 * np.abs(want).max())
-
-
-@pytest.mark.parametrize("sensor", ["position", "range_bearing"])
-def test_points_in_the_world_are_what_they_are(x64, sensor):
-    world = world_of(sensor, [[1, 0], [2, 1]])
-    point, cov, known = landmarks.to_world(sensor, world)
-    np.testing.assert_array_equal(np.array(point), world.mean)
-    np.testing.assert_array_equal(np.array(cov), np.array(geometry.covariance(world.factor)))
-    assert known.all()
-
-
-def brute_force(sensor, world, weight, birth):
-    """Mean and covariance of the mixture of all particles' landmarks of this birth."""
-    point, cov, known = (np.asarray(v) for v in landmarks.to_world(sensor, world))
-    shares, means, covs = [], [], []
-    for m, n in np.argwhere(np.asarray(world.birth) == birth):
-        if world.count[m, n] > 0 and known[m, n]:
-            shares.append(weight[n])
-            means.append(point[:, m, n])
-            covs.append(matrix(cov[:, m, n]))
-    shares, means = np.array(shares) / np.sum(shares), np.array(means)
-    mean = shares @ means
-    own = np.einsum("i,ijk->jk", shares, np.array(covs))
-    return mean, own + (means - mean).T @ np.diag(shares) @ (means - mean)
-
-
-@pytest.mark.parametrize("sensor", ["range_bearing", "bearing"])
-def test_the_summary_is_the_mixture_over_the_particles(x64, sensor):
-    rng = np.random.default_rng(4)
-    particles, slots, best = 6, 5, 2
-    count = rng.integers(0, 4, (slots, particles))
-    count[:, best] = [2, 1, 0, 3, 1]
-    world = world_of(sensor, count)
-    # The same births, in each particle in other slots; some in none, some emptied.
-    birth = np.array([rng.permutation([3, 14, 15, 92, 65]) for _ in range(particles)]).T
-    log_odds = np.full(count.shape, 9.0)
-    log_odds[3, best] = 4.9  # not confirmed yet
-    factor = np.array(world.factor)
-    if sensor == "bearing":
-        factor[2, 4, best] = 5.0  # of unknown depth
-        factor[2, 0, 0] = 5.0  # and one that another particle must not average in
-        birth[[0, *np.flatnonzero(birth[:, 0] == birth[0, best])], 0] = birth[
-            [*np.flatnonzero(birth[:, 0] == birth[0, best]), 0], 0
-        ]
-        count[0, 0] = 2
-    world = world._replace(
-        birth=jnp.asarray(birth),
-        log_odds=jnp.asarray(log_odds),
-        factor=jnp.asarray(factor),
-        count=jnp.asarray(count),
-    )
-    weight = rng.dirichlet(np.ones(particles))
-    config = Config(sensor=sensor, particles=particles, landmarks=slots)
-    table = landmarks.summarise(world, jnp.asarray(weight), best, PARAMS, config)
-    ripe = sensor != "bearing"
-    np.testing.assert_array_equal(table.kept, [True, True, False, False, ripe])
-    np.testing.assert_array_equal(table.birth, birth[:, best])
-    np.testing.assert_array_equal(table.count, count[:, best])
-    for m in np.flatnonzero(table.kept):
-        mean, cov = brute_force(sensor, world, weight, birth[m, best])
-        np.testing.assert_allclose(table.mean[:, m], mean, atol=1e-10)
-        np.testing.assert_allclose(matrix(table.cov[:, m]), cov, atol=1e-10)
-
-
-def test_without_existence_every_landmark_is_confirmed(x64):
-    world = world_of("range_bearing", [[1, 1], [0, 1]], forgetting=False)
-    config = Config(association="known", particles=2, landmarks=2)
-    table = landmarks.summarise(world, jnp.array([0.5, 0.5]), 0, PARAMS, config)
-    np.testing.assert_array_equal(table.kept, [True, False])
 
 
 @pytest.mark.parametrize("sensor", SENSORS)

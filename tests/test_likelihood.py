@@ -118,7 +118,7 @@ def test_the_forward_score_is_that_of_reverse_mode(x64, monkeypatch, sensor):
     names = likelihood.learnable(config)
     with monkeypatch.context() as patch:
         patch.setattr(jax.lax, "while_loop", bounded)
-        back = jax.jit(lambda alpha: backwards(params, data, config, names, alpha))
+        back = quick(lambda alpha: backwards(params, data, config, names, alpha))
         expected = {alpha: back(alpha) for alpha in (1.0, 0.9)}
     for alpha, (gradient, resampled) in expected.items():
         found = likelihood.score(params, data, KEY, config, names, discount=alpha)

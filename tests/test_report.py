@@ -12,6 +12,7 @@ from small_run import LANDMARKS, START, make_log, make_refined, make_result
 from jaxslam import evaluate, report
 from jaxslam.config import Config, Params
 from jaxslam.error_table import error_table
+from jaxslam.events import events as events_of
 from jaxslam.log import Truth, save_log
 
 NAME = "lost-in-the-woods"
@@ -156,7 +157,7 @@ def test_events_tell_what_happened_and_when():
     overflow, degenerate = np.zeros(40), np.zeros(40, bool)
     overflow[10], degenerate[12] = 0.25, True
     result = dataclasses.replace(result, overflow=overflow, degenerate=degenerate)
-    events = [json.loads(line) for line in report.event_lines(result)]
+    events = list(events_of(result))
     assert [event["step"] for event in events] == [0, 1, 2, 3, 10, 12, 19, 39]
     assert events[0] == {"step": 0, "t": 0, "ess": 100, "new": 1}
     assert events[4] == {"step": 10, "t": 2, "ess": 70, "overflow": 0.25}

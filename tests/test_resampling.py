@@ -1,8 +1,11 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxslam.config import Config
 from jaxslam.resampling import gather, systematic
 
 
@@ -51,8 +54,8 @@ def test_gather_takes_rows_at_the_ancestors_or_leaves_them():
         "count": jnp.asarray(rng.integers(0, 9, (5, 40))),
     }
     ancestors = jnp.asarray(np.sort(rng.integers(0, 40, 40)))
-    taken = jax.jit(gather)(tree, ancestors, True)
-    left = jax.jit(gather)(tree, ancestors, False)
+    copy = jax.jit(partial(gather, config=Config(particles=40)))
+    taken, left = copy(tree, ancestors, True), copy(tree, ancestors, False)
     for name, leaf in tree.items():
         np.testing.assert_array_equal(taken[name], leaf[..., ancestors])
         np.testing.assert_array_equal(left[name], leaf)

@@ -1,5 +1,6 @@
 """Whole runs: shapes, types, seeds, places, and that nothing lost stays unsaid."""
 
+import re
 from dataclasses import replace
 
 import jax
@@ -7,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import births, runner
+from jaxslam import births, outcome, runner
 from jaxslam import filter as fastslam
 from jaxslam.config import Config, default_params
 from jaxslam.evaluate import ate
 from jaxslam.runner import config_for, refined
 from jaxslam.simulate import planar
 
-SIZES = dict(particles=30, landmarks=30)
+SIZES = dict(particles=30, landmarks=30, measurements=10)  # test_offline's: compiled once
 
 
 def run(*given, **named):
@@ -96,7 +97,7 @@ def test_landmarks_without_a_depth_stay_out_of_the_map():
         count=world.count.at[2].set(0), birth=jnp.array([[7, 7], [8, 8], [9, 9]], jnp.int32)
     )
     params = default_params("bearing")
-    found = runner._map(
+    found = outcome._map(
         state._replace(landmarks=world), 0, params, config, np.empty(0, int), np.array([5.0, 0, 0])
     )
     np.testing.assert_array_equal(found.id, [7])
@@ -135,9 +136,10 @@ def test_matches_tell_which_measurement_began_the_landmark(log, config, result):
 
 def test_progress_is_told_from_the_start_to_the_end(log, result, calls):
     total = len(log.frame_time)
-    assert calls[0] == (0, total) and calls[-1] == (total, total)
-    done = [d for d, _ in calls]
-    assert done == sorted(done) and {t for _, t in calls} == {total}
+    assert calls[0] == (0, total, "") and calls[-1][:2] == (total, total)
+    done = [d for d, *_ in calls]
+    assert done == sorted(done) and {t for _, t, _ in calls} == {total}
+    assert re.fullmatch(r"[\d.e+]+ steps/s, ESS \d+, \d+ landmarks, [\d.]+ GB", calls[-1][2])
 
 
 def same(a, b):
@@ -166,8 +168,8 @@ def test_the_past_is_that_of_the_living(log, config, result):
 
 
 def test_a_chunks_length_changes_nothing(log, config, result, monkeypatch):
-    # Seven frames hand over this much; one fewer fits.
-    monkeypatch.setattr(runner, "CHUNK_BYTES", 28 * (config.measurements + 4) * 30 - 1)
+    # Eight frames hand over this much; one fewer fits.
+    monkeypatch.setattr(runner, "CHUNK_BYTES", 32 * (config.measurements + 4) * 30 - 1)
     other = run(log, config, seed=3)
     same(other, result)
     for one, two in zip(
