@@ -80,6 +80,7 @@ class Checkpoints:
 
     def __enter__(self):
         report.check_target(self.folder, self.overwrite, self.resume)
+        self._above = [place for place in self.folder.parents if not place.exists()]
         self.folder.mkdir(parents=True, exist_ok=True)
         self._lock = lock.take(self.folder)
         names = {path.name for path in self.folder.iterdir()} - {lock.NAME}
@@ -96,9 +97,9 @@ class Checkpoints:
             self.clear()
         # While the lock is still held; whoever waits for it makes a file of its own.
         (self.folder / lock.NAME).unlink(missing_ok=True)
-        if not any(self.folder.iterdir()):
-            with suppress(OSError):
-                self.folder.rmdir()
+        with suppress(OSError):  # not empty
+            for place in (self.folder, *self._above):
+                place.rmdir()
         os.close(self._lock)
         if kind is KeyboardInterrupt and not error.args and self._files():
             raise KeyboardInterrupt(AGAIN) from None

@@ -39,7 +39,7 @@ def test_the_compilers_own_temporaries_count(there, call, monkeypatch):
     assert whole.temporaries > 0 and whole.total > quick.total
     monkeypatch.setattr(capacity, "available", lambda: quick.total + 1)
     code, _, err = call(
-        "run", "log.npz", "--particles", 30, "--landmarks", 30, "--out", "out",
+        "run", "log.npz", "--particles", 30, "--landmarks", 30, "--out", "new/out",
         "--checkpoint-every", "5m",
     )  # fmt: skip
     told, refused = err.splitlines()
