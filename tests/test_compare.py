@@ -76,6 +76,7 @@ def small(steps=12):
     return log, Config(particles=4, measurements=4, landmarks=3, proposal="prior")
 
 
+@pytest.mark.slow
 def test_comparison_in_both_precisions():
     log, config = small()
     calls = []

@@ -79,6 +79,7 @@ def test_devices_make_no_difference(short):
     assert int(lines[0][1]) > 0 and int(lines[0][2]) > 5
 
 
+@pytest.mark.slow
 def test_rejuvenation_is_the_same_on_devices(short):
     settings = dict(sensor="bearing", particles=504, block=100, landmarks=40, rejuvenate=1.5)
     lines = bits(short, settings, [dict(), dict(devices=2, chunk=7)])

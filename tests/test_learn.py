@@ -145,6 +145,7 @@ print(*np.asarray(found.total, float).ravel(), *np.asarray(found.log_likelihood,
 """
 
 
+@pytest.mark.slow
 def test_two_devices_give_what_one_gives(pytestconfig):
     outs = [
         subprocess.run(

@@ -193,6 +193,7 @@ def drive_among_marks(sensor, steps=5):
 
 
 @pytest.mark.parametrize("sensor", ["bearing", "range_bearing"])
+@pytest.mark.slow
 def test_few_informed_particles_agree_with_very_many_of_the_prior(x64, sensor):
     """Where nothing is linear: evidence Z and mean pose within what sampling allows.
 

@@ -243,6 +243,7 @@ def test_known_identities_can_be_rejuvenated(log):
 
 
 @pytest.mark.parametrize("sensor", ["range_bearing", "position"])
+@pytest.mark.slow
 def test_points_can_be_rejuvenated(log, sensor):
     settings = SETTINGS | dict(sensor=sensor, rejuvenate=3.0)
     got = errors(run(log, runner.config_for(log, **settings), seed=2))

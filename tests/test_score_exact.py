@@ -135,11 +135,13 @@ def test_fisher_with_discount_1_is_exact(x64, oracle, proposal):
     assert error.max() < 0.06  # sharp
 
 
+@pytest.mark.slow
 def test_plain_differentiation_is_rejected(x64, oracle):
     z, _ = off_by(oracle, "prior", "plain", QUICK)
     assert np.abs(z[:-1]).max() > 8 and abs(z[-1]) < 4
 
 
+@pytest.mark.slow
 def test_without_the_associations_score_it_is_rejected(x64, oracle, without_association_score):
     z, _ = off_by(oracle, "prior", "fisher", QUICK)
     assert np.abs(z[:-1]).max() > 8 and abs(z[-1]) < 4
