@@ -1,6 +1,6 @@
 """Kill long runs (SIGKILL) at random moments, go on with them, and compare with an undisturbed one.
 
-    python experiments/kills.py [--kills 100]
+    python experiments/kills.py [--kills 100] [--particles 8000] [--frames 600]
 
 Every run is started anew with --resume until it ends by itself; moments are drawn evenly from the
 time an undisturbed run takes. Writes experiments/results/kills.md. About a quarter of an hour.
@@ -117,7 +117,11 @@ def one_run(place, most, draw, took, particles, phases, frames):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--kills", type=int, default=100)
-    rows, phases = kill_and_resume(parser.parse_args().kills)
+    # So many that most of the time goes into filtering.
+    parser.add_argument("--particles", type=int, default=8000)
+    parser.add_argument("--frames", type=int, default=600)
+    given = parser.parse_args()
+    rows, phases = kill_and_resume(given.kills, given.particles, given.frames)
     total = {name: sum(row[name] for row in rows) for name in rows[0]}
     when = ", ".join(f"{count} {name}" for name, count in phases.most_common())
     lines = [
@@ -126,7 +130,7 @@ def main():
         f"| {len(rows)} | {total['kills']} | {total['resumes']} | {total['equal']} of {len(rows)} "
         f"| {total['unreadable']} | {total['strays']} |",
         "",
-        f"Killed while: {when}. 200 particles, 400 frames.",
+        f"Killed while: {when}. {given.particles:,} particles, {given.frames} frames.",
     ]
     print(*lines, sep="\n")
     RESULTS.mkdir(exist_ok=True)
