@@ -127,13 +127,10 @@ def _run_long(task):
     every = offline.seconds(every)
     if overwrite and resume:
         raise ValueError("--resume goes on with a run, --overwrite replaces it; choose one")
-    if Path(task.name).resolve().is_relative_to(out.resolve()):
-        raise ValueError(
-            f"{task.name}: is in {out}, where results are replaced; choose another --out"
-        )
+    _check_beside(task)
     with offline.Checkpoints(out, every, resume, overwrite) as checkpoints:
         if checkpoints.finished:
-            offline.check_finished(out, task.config, task.params, task.seed)
+            offline.check_finished(out, task.log, task.config, task.params, task.seed)
             print(f"{out}: is finished already; nothing to do")
             return None
         result = filtered(task, checkpoints)
@@ -142,6 +139,14 @@ def _run_long(task):
         checkpoints.clear()
     told(result, out)
     return result
+
+
+def _check_beside(task):
+    """Raise `ValueError` if the log is where results are replaced."""
+    if Path(task.name).resolve().is_relative_to(task.out.resolve()):
+        raise ValueError(
+            f"{task.name}: is in {task.out}, where results are replaced; choose another --out"
+        )
 
 
 def run_shared(task, place, guarded):
@@ -207,6 +212,7 @@ def run_many(task, seeds, sweep, devices):
     from jaxslam import many
 
     todo = many.tasks(seeds, task.params, sweep)
+    _check_beside(task)
     many.check_target(task.out, task.overwrite)
     with bar("running", compiles=True) as progress:
         results = many.run(task.log, task.config, todo, progress, not task.no_refine, devices)

@@ -93,7 +93,7 @@ def _axis(text):
     if not equals or name not in Params._fields:
         raise ValueError(f"--sweep is {text!r}; must be a parameter's name and values, like a=1,2")
     try:
-        return name, [float(value) for value in values.split(",")]
+        return name, list(dict.fromkeys(float(value) for value in values.split(",")))
     except ValueError:
         raise ValueError(f"--sweep {name}: {values!r} are not numbers, like 0.05,0.1") from None
 
@@ -227,6 +227,11 @@ def _cells(row, names):
     return [format(_value(row[name]), SHOWN[name][1]) for name in names]
 
 
+def _short(value):
+    """A number as text, short if that is still the number."""
+    return f"{value:g}" if float(f"{value:g}") == value else repr(float(value))
+
+
 def check_target(folder, overwrite):
     """Raise `ValueError` if the folder of many runs can't be written here."""
     folder = Path(folder)
@@ -235,8 +240,13 @@ def check_target(folder, overwrite):
         return
     if not overwrite:
         raise ValueError(f"{folder}: exists; choose another folder or add --overwrite")
-    if any(folder.iterdir()) and not (folder / TABLE).is_file():
+    names = {path.name for path in folder.iterdir()}
+    if names and TABLE not in names:
         raise ValueError(f"{folder}: holds no {TABLE}, so it is not overwritten")
+    for name in sorted(names - {TABLE}):
+        if not name.startswith("seed-"):
+            raise ValueError(f"{folder}: holds {name}, which is no run's; it is not overwritten")
+        report.check_target(folder / name, overwrite=True)
 
 
 def save(todo, results, folder, overwrite=False, log_source=None):
@@ -248,7 +258,9 @@ def save(todo, results, folder, overwrite=False, log_source=None):
     partly.mkdir()
     try:
         for task, result in zip(todo, results, strict=True):
-            name = "-".join([f"seed-{task.seed}", *(f"{k}-{v:g}" for k, v in task.told.items())])
+            name = "-".join(
+                [f"seed-{task.seed}", *(f"{k}-{_short(v)}" for k, v in task.told.items())]
+            )
             report.save(result, partly / name, log_source=log_source, figures=False)
         found = rows(todo, results)
         with open(partly / TABLE, "w", newline="", encoding="utf-8") as file:

@@ -178,6 +178,8 @@ class Checkpoints:
             os.close(ends[1])
             watch.join()
             os.close(ends[0])
+        if self.stopped:  # while the last checkpoint was being written
+            raise KeyboardInterrupt(AGAIN)
 
     def _watch(self, end):
         """Read signals until the other end is closed."""
@@ -278,8 +280,11 @@ class Followed:
             self._wait()
 
 
-def check_finished(folder, config, params, seed):
+def check_finished(folder, log, config, params, seed):
     """Raise `ValueError` if the run that is finished there was told otherwise."""
+    with np.load(folder / "steps.npz") as steps:
+        if not np.array_equal(steps["time"], log.frame_time):
+            raise ValueError(f"{folder}: is finished, but of another log, or part of it")
     before = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8"))
     if differing := differences(before, _numbers(config, params, seed)):
         raise ValueError(f"{folder}: is finished, but of another run; differing: {differing}")

@@ -102,7 +102,7 @@ def _found(at, params, config, identities, origin):
 def _looking_back(at, log_weight, best, origin):
     """`Result.ancestral` and `Result.lineage`, in the world's frame, and the past's events."""
     if at.tree is None:
-        return {}
+        return dict(events=None if at.past is None else at.past.event)
     whole, past, before = ancestral(at.tree, log_weight), lineage(at.tree, best), at.past
     if before is not None:
         # Every particle has drawn a path of its own there.

@@ -16,6 +16,7 @@ from jaxslam import bundle, chain, regroup
 ROUNDS, ROUNDS_AGAIN = 10, 3
 MISTAKEN = 1e-4  # probability, at least, that a measurement was taken for the wrong landmark
 TRIES = 3  # times that a landmark may enter the map
+LARGE = 40_000_000  # frames times landmarks, from which on those seen once are left out
 WIDE, WIDER, NARROW = (8.0, 4.0, 2.0, 1.0), (4.0, 2.0, 1.0), (1.0,)  # kernels: `bundle.fit`
 
 
@@ -102,6 +103,15 @@ def _groups(name, place, known):
     return regroup.Groups(group, label, np.full((len(label), 2), np.nan))
 
 
+def _seen_again(groups):
+    """`Groups` without those of one measurement, which tell nothing of the path: where much is
+    clutter, or the map was full, they are far more than the rest, and matrices of all of them would
+    not fit."""
+    again = np.bincount(groups.of[groups.of >= 0], minlength=len(groups.label)) > 1
+    number = np.append(np.where(again, np.cumsum(again) - 1, -1), -1)
+    return regroup.Groups(number[groups.of], groups.label[again], groups.point[again])
+
+
 def solved(given, place, pose, name, known, again=False, progress=None):
     """Solve and check again until nothing changes: `Solved`.
 
@@ -111,6 +121,8 @@ def solved(given, place, pose, name, known, again=False, progress=None):
     """
     widths, most = (NARROW, ROUNDS_AGAIN) if again else (WIDE, ROUNDS)
     groups = _groups(name, place, known)
+    if not known and len(pose) * len(groups.label) > LARGE:
+        groups = _seen_again(groups)
     path = np.vstack([given.start, pose]).astype(float)
     done, iterations, merged = 0, 0, []
     tries = np.full(len(groups.label), TRIES)

@@ -150,8 +150,10 @@ class Rejuvenation:
         first), and how many find none."""
         slots, there = np.full(len(label), -1), np.flatnonzero(seen)
         if self._known:
-            slots[there] = self._identity[label[there]]
-            return slots, 0
+            slot = self._identity[label[there]]
+            fits = slot < self._config.landmarks
+            slots[there[fits]] = slot[fits]
+            return slots, 0  # the filter counts those without a slot whenever they are seen
         order = there[np.argsort(-seen[there], kind="stable")][: self._config.landmarks]
         slots[np.sort(order)] = np.arange(len(order))
         return slots, len(there) - len(order)

@@ -242,9 +242,10 @@ def _looked_back(result):
     told = {}
     if result.ancestral is not None:
         told["least_ancestors"] = int(np.min(result.ancestral.distinct, initial=2**31))
+    if result.refine_seconds is not None:
+        told["refine_seconds"] = result.refine_seconds
     if (found := result.refined) is not None:
         told |= {
-            "refine_seconds": result.refine_seconds,
             "refine_rounds": int(found.rounds),
             "refine_converged": bool(found.converged),
             "n_landmarks_refined": len(found.mean),

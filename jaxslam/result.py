@@ -115,6 +115,8 @@ class Result:
             lines.append(f"all weights were zero in {int(np.sum(self.degenerate))} frames")
         if not (np.isfinite(self.pose).all() and np.isfinite(self.cov).all()):
             lines.append("the pose estimate is not finite")
+        if self.refined is None and self.refine_seconds is not None:
+            lines.append("path and map could not be refined, for want of memory or of a solution")
         return lines
 
     @cached_property
@@ -155,6 +157,7 @@ class Result:
         if self.ancestral is None:
             return [
                 "the particles' genealogy took too much memory: only the filter's path is there"
+                + (", rejuvenated no more from then on" if self.config.rejuvenate else "")
             ]
         if not len(self.time) or self.ancestral.distinct[0] > 1:
             return []

@@ -90,7 +90,8 @@ def started(log, config, key):
 
 def refined(result, progress=None):
     """The result with its best particle's lineage refined (`refine.refine`); as it is if it has no
-    finite lineage. `progress`: called with (iterations done, None)."""
+    finite lineage, or (with `refine_seconds`, and a flag) if that takes too much memory or has no
+    solution. `progress`: called with (iterations done, None)."""
     from jaxslam.refine import refine  # here: the filter alone does without it
 
     past, log, config = result.lineage, result.log, result.config
@@ -98,11 +99,14 @@ def refined(result, progress=None):
         return result
     begin = time.perf_counter()
     data = framed(log, config, result.params)
-    found = refine(
-        data, past.pose, past.birth, log.start_pose, log.start_cov, result.params, config.sensor,
-        known=config.association == "known",
-        progress=progress and (lambda done, _: progress(done, None)),
-    )  # fmt: skip
+    try:
+        found = refine(
+            data, past.pose, past.birth, log.start_pose, log.start_cov, result.params,
+            config.sensor, known=config.association == "known",
+            progress=progress and (lambda done, _: progress(done, None)),
+        )  # fmt: skip
+    except (MemoryError, np.linalg.LinAlgError):  # what was filtered is not lost with it
+        return dataclasses.replace(result, refine_seconds=time.perf_counter() - begin)
     found = found._replace(identity=identity_of(found.identity, data.identities))
     return dataclasses.replace(result, refined=found, refine_seconds=time.perf_counter() - begin)
 
