@@ -36,11 +36,14 @@ class Place(NamedTuple):
 
 
 def place(coordinator=None, processes=None, process=None, env=os.environ):
-    """`Place` as the three options say, or Slurm or Open MPI where they don't; None: alone.
+    """`Place` as the three options say, or Slurm or Open MPI where they don't; None: alone, as with
+    `processes` 1 whatever a launcher says.
 
     Raises `ValueError` for options that do not fit together.
     """
     given = (coordinator, processes, process)
+    if given == (None, 1, None):
+        return None
     given = [a if a is not None else b for a, b in zip(given, _launched(env), strict=True)]
     names = "--coordinator", "--num-processes", "--process-id"
     missing = [name for name, value in zip(names, given, strict=True) if value is None]

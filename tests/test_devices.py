@@ -330,6 +330,8 @@ def test_options_go_before_the_launcher():
     assert place == Place("::1", 80, 2, 1) and place.address == "[::1]:80"
     with pytest.raises(ValueError, match="--coordinator missing; "):
         hosts.place(env=MPI)
+    # A launcher's processes with a run each.
+    assert hosts.place(processes=1, env=MPI) is hosts.place(processes=1, env=SLURM) is None
 
 
 def test_a_run_is_the_same_whoever_shares_it():
