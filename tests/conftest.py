@@ -9,6 +9,7 @@ import pytest
 
 from jaxslam import cli
 
+LONGEST = "test_the_commands_run", "test_the_python_that_learns_runs"
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
@@ -21,6 +22,11 @@ def pytest_configure(config):
         jax.config.update("jax_compilation_cache_dir", place.name)
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+
+
+def pytest_collection_modifyitems(items):
+    """The longest come first: begun last, each would keep one worker busy and the others idle."""
+    items.sort(key=lambda item: getattr(item, "originalname", None) not in LONGEST)
 
 
 @pytest.fixture
