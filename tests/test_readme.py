@@ -47,6 +47,8 @@ def test_the_python_that_learns_runs(tmp_path, monkeypatch):
 def test_the_commands_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     told = fewer("\n".join(blocks("sh")), "--particles 20000 ", "--particles 2000 ")
+    for out in ("runs/bearing", "runs/learnt"):  # the demo goes through the whole log
+        told = fewer(told, f"--out {out}", f"--end 100 --out {out}")
     lines = told.splitlines()
     commands = [
         shlex.split(line, comments=True)[1:] for line in lines if line.startswith("jaxslam ")
