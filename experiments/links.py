@@ -21,7 +21,7 @@ import numpy as np
 import worlds
 
 from jaxslam import config_for, default_params, load_log, run
-from jaxslam.evaluate import errors, landmark_gate
+from jaxslam.evaluate import errors, landmark_gate, wrap
 from jaxslam.motion import model
 from jaxslam.runner import framed
 
@@ -42,10 +42,6 @@ def logs():
         log, file = batch.mrclam(robot)
         if log is not None:
             yield f"MRCLAM D6 robot {robot}", log, batch.gained(log, file, "bearing")
-
-
-def wrap(angle):
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def followed(log, params):
