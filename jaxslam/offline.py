@@ -16,6 +16,7 @@ import time
 import tomllib
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from zipfile import BadZipFile
 
 import jax
 import jax.numpy as jnp
@@ -282,9 +283,13 @@ class Followed:
 
 def check_finished(folder, log, config, params, seed):
     """Raise `ValueError` if the run that is finished there was told otherwise."""
-    with np.load(folder / "steps.npz") as steps:
-        if not np.array_equal(steps["time"], log.frame_time):
-            raise ValueError(f"{folder}: is finished, but of another log, or part of it")
+    try:
+        with open(folder / "steps.npz", "rb") as file, np.load(file) as steps:
+            same = np.array_equal(steps["time"], log.frame_time)
+    except (BadZipFile, KeyError, ValueError, EOFError) as error:
+        raise ValueError(f"{folder}: is finished, but broken ({error}); run it again") from error
+    if not same:
+        raise ValueError(f"{folder}: is finished, but of another log, or part of it")
     before = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8"))
     if differing := differences(before, _numbers(config, params, seed)):
         raise ValueError(f"{folder}: is finished, but of another run; differing: {differing}")

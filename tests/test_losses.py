@@ -83,6 +83,12 @@ def test_a_finished_run_is_not_that_of_another_log(log, call, refuse):
     words = *LONG, "--no-refine"
     assert call(*words)[0] == 0
     assert call(*words, "--resume")[1].endswith("nothing to do\n")
+    with open("out/steps.npz", "r+b") as file:
+        whole = file.read()
+        file.truncate(100)
+    assert "out: is finished, but broken (" in refuse(*words, "--resume")
+    with open("out/steps.npz", "wb") as file:
+        file.write(whole)
     os.remove("log.npz")
     save_log("log.npz", cut(log, 0, 5))
     assert "is finished, but of another log, or part of it" in refuse(*words, "--resume")
