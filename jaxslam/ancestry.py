@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import devices
+from jaxslam import borders, devices
 from jaxslam.listing import rounds
 
 CURRENT = -1
@@ -49,27 +49,65 @@ def update(world, ancestry, wanted, config):
     """
     behind = (ancestry.chain != CURRENT) & wanted
     slots, count = jnp.nonzero(behind, size=len(behind), fill_value=0)[0], behind.sum()
+    near = 0
+    if borders.width(config):
+        used = (ancestry.chain == jnp.arange(len(ancestry.begun))[:, None]) & behind
+        enough = borders.enough(ancestry.chains, config) | ~used.any(1)
+        # One of two loops has no rounds: a `cond` would copy the map.
+        near = jnp.where(enough.all(), count, 0)
+        world = _updated_near(world, ancestry, slots, near, config)
+    world = _updated(world, ancestry, slots, count - near, config)
+    return world, ancestry._replace(chain=jnp.where(behind, CURRENT, ancestry.chain))
+
+
+def _updated(world, ancestry, slots, count, config):
+    """The map with the first `count` of the slots brought up to date."""
     # Rows travel between devices some at a time.
     some = 1 if config.devices == 1 else max(1, min(8, TOGETHER // config.particles))
 
-    def row(leaf, slot):
-        return jax.lax.dynamic_index_in_dim(leaf, slot, leaf.ndim - 2, keepdims=False)
-
-    def put(leaf, new, slot):
-        return jax.lax.dynamic_update_index_in_dim(leaf, new, slot, leaf.ndim - 2)
-
-    def update_some(i, leaves):
+    def update_some(i, world):
         # Beyond the last comes the last again, which does no harm: all are read before any is put.
         at = [slots[jnp.minimum(i * some + j, count - 1)] for j in range(some)]
-        rows = [jax.tree.map(partial(row, slot=slot), leaves) for slot in at]
-        indices = devices.mine([row(ancestry.chains, ancestry.chain[s]) for s in at], config)
+        rows = [jax.tree.map(partial(_row, slot=slot), world) for slot in at]
+        indices = [_index(ancestry, slot, config) for slot in at]
         for slot, new in zip(at, devices.taken(rows, indices, config), strict=True):
-            leaves = jax.tree.map(partial(put, slot=slot), leaves, new)
-        return leaves
+            world = jax.tree.map(partial(_put, slot=slot), world, new)
+        return world
 
-    leaves = rounds(-(-count // some), update_some, world)
-    chain = jnp.where(behind, CURRENT, ancestry.chain)
-    return leaves, ancestry._replace(chain=chain)
+    return rounds(-(-count // some), update_some, world)
+
+
+def _updated_near(world, ancestry, slots, count, config):
+    """`_updated` where the neighbours' borders are all that a device needs of others."""
+    some = max(1, min(8, TOGETHER // (2 * borders.width(config))))
+
+    def update_some(i, world):
+        first = i * some
+        at = [slots[jnp.minimum(first + j, count - 1)] for j in range(some)]
+        border = borders.of_slots(world, at, config)
+
+        def update_one(j, world):
+            slot = slots[first + j]
+            taken = partial(borders.put, slot=slot, index=_index(ancestry, slot, config))
+            side = jax.tree.map(partial(_row, slot=j), border)
+            return jax.tree.map(partial(taken, config=config), world, side)
+
+        return rounds(jnp.minimum(some, count - first), update_one, world)
+
+    return rounds(-(-count // some), update_some, world)
+
+
+def _index(ancestry, slot, config):
+    """Where what a device's particles have in a slot is, among all particles."""
+    return devices.mine(_row(ancestry.chains, ancestry.chain[slot]), config)
+
+
+def _row(leaf, slot):
+    return jax.lax.dynamic_index_in_dim(leaf, slot, leaf.ndim - 2, keepdims=False)
+
+
+def _put(leaf, new, slot):
+    return jax.lax.dynamic_update_index_in_dim(leaf, new, slot, leaf.ndim - 2)
 
 
 def last_of(ancestry):

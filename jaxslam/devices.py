@@ -2,8 +2,8 @@
 
 Each device moves, associates and updates its own particles. What concerns all (weights, ancestors,
 bounds) is worked out on every device from the same numbers in the same order, so that the result
-is that of one device, bit for bit. Only log weights, poses and the rows of landmarks that are
-about to be looked at travel.
+is that of one device, bit for bit. Only log weights, poses and, of the landmarks that are about
+to be looked at, what is needed of others travel (`borders`).
 """
 
 from functools import partial
@@ -177,14 +177,34 @@ def _gathered(leaves):
     """The same leaves [..., n] of all devices, in few large messages (a small one costs as much as
     some ten thousand numbers): of every width of number an array [devices, rows, n], as it comes,
     and which rows (leaf, from, to) are whose."""
+    for rows, whose in _joined(leaves):
+        yield jax.lax.all_gather(rows, AXIS), whose
+
+
+def _joined(leaves):
+    """Of every width of number an array [rows, n] of the leaves [..., n], and whose rows are whose
+    (leaf, from, to)."""
     n = leaves[0].shape[-1]
     for size in sorted({leaf.dtype.itemsize for leaf in leaves}):
         number = {4: jnp.uint32, 8: jnp.uint64}[size]
         these = [i for i, leaf in enumerate(leaves) if leaf.dtype.itemsize == size]
         rows = [jax.lax.bitcast_convert_type(leaves[i], number).reshape(-1, n) for i in these]
         ends = np.cumsum([0, *map(len, rows)])
-        every = jax.lax.all_gather(jnp.concatenate(rows), AXIS)
-        yield every, list(zip(these, ends[:-1], ends[1:], strict=True))
+        yield jnp.concatenate(rows), list(zip(these, ends[:-1], ends[1:], strict=True))
+
+
+def of_neighbours(leaves, b, config):
+    """Of leaves [..., 2 b], every device's first and last b: the last of the device before, and the
+    first of the one after it (zeros where there is none)."""
+    found, pairs = list(leaves), range(config.devices - 1)
+    for rows, whose in _joined(leaves):
+        before = jax.lax.ppermute(rows[:, b:], AXIS, [(i, i + 1) for i in pairs])
+        after = jax.lax.ppermute(rows[:, :b], AXIS, [(i + 1, i) for i in pairs])
+        both = jnp.concatenate([before, after], 1)
+        for i, begin, end in whose:
+            part = both[begin:end].reshape(leaves[i].shape)
+            found[i] = jax.lax.bitcast_convert_type(part, leaves[i].dtype)
+    return found
 
 
 def mine(tree, config):

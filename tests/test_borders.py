@@ -1,0 +1,97 @@
+"""Rows read through ancestors on several devices: all of them travel, or the borders alone."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxslam import borders
+from jaxslam.config import Config
+
+ROOT = Path(__file__).resolve().parents[1]
+N, DEVICES = 160, 4
+n, b = N // DEVICES, N // DEVICES // borders.SHARE
+
+UPDATED = """
+import sys
+from functools import partial
+import jax, jax.numpy as jnp
+jax.config.update("jax_num_cpu_devices", 4)
+import numpy as np
+from jaxslam import ancestry, borders, devices
+from jaxslam.config import Config
+from jaxslam.landmarks import Landmarks
+
+config = Config(particles=160, landmarks=24, chains=2, devices=4)
+rng = np.random.default_rng(0)
+world = Landmarks(
+    mean=rng.normal(size=(2, 24, 160)).astype("f"),
+    factor=rng.normal(size=(3, 24, 160)).astype(jnp.result_type(float)),
+    anchor=None, log_odds=None, count=rng.integers(0, 9, (24, 160)).astype("i"),
+    birth=rng.integers(0, 9, (24, 160)).astype("i"),
+)
+behind = rng.integers(-1, 2, 24).astype("i")
+for amount in map(int, sys.argv[1:]):
+    chains = np.arange(160) + amount + rng.integers(-2, 3, (2, 160))
+    chains = np.sort(np.clip(chains, 0, 159), -1).astype("i")
+    past = ancestry.new(config)._replace(chains=jnp.asarray(chains), chain=jnp.asarray(behind))
+    wanted = rng.uniform(size=24) < 0.8
+    found, after = devices.divided(
+        partial(ancestry.update, config=config),
+        (devices.lanes(world), devices.same(past), devices.ALL),
+        (devices.lanes(world), devices.same(past)), config,
+    )(jax.tree.map(jnp.asarray, world), past, jnp.asarray(wanted))
+    due = wanted & (behind >= 0)
+    for one, leaf in zip(jax.tree.leaves(world), jax.tree.leaves(found), strict=True):
+        expected = one.copy()
+        for slot in np.flatnonzero(due):
+            expected[..., slot, :] = one[..., slot, chains[behind[slot]]]
+        np.testing.assert_array_equal(leaf, expected)
+    assert (np.asarray(after.chain) == np.where(due, -1, behind)).all()
+    print(bool(borders.enough(past.chains, config).all()), int(due.sum()))
+"""
+
+
+@pytest.mark.parametrize("precision", ["0", "1"])
+def test_rows_are_the_same_whether_all_travel_or_only_borders(precision):
+    """Also of numbers of 8 bytes."""
+    done = subprocess.run(
+        [sys.executable, "-c", UPDATED, "0", "1", "-3", "9", "-60", "400"],
+        capture_output=True, text=True, cwd=ROOT, env=os.environ | {"JAX_ENABLE_X64": precision},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    near, due = zip(*(line.split() for line in done.stdout.splitlines()), strict=True)
+    assert near[:2] == ("True", "True") and near[-2:] == ("False", "False")
+    assert min(map(int, due)) > 8  # more than a message
+
+
+def needed(index):
+    """Whether what every device needs of others, and for whom, is within borders: one by one."""
+    for i, at in enumerate(index):
+        low = i // n * n
+        lane = i - low
+        if at < low and (at < low - b or lane >= b):
+            return False
+        if at >= low + n and (at >= low + n + b or lane < n - b):
+            return False
+    return True
+
+
+def test_borders_are_enough_where_they_are():
+    rng, config = np.random.default_rng(1), Config(particles=N, devices=DEVICES)
+    found = []
+    for amount in np.repeat(np.arange(-11, 12), 20):
+        index = np.arange(N) + amount + rng.integers(-2, 3, N)
+        index = np.sort(np.clip(index, 0, N - 1)).astype("i")
+        assert bool(borders.enough(index, config)) == needed(index)
+        found.append(needed(index))
+    assert 20 < sum(found) < len(found) - 20
+
+
+def test_without_devices_or_particles_enough_there_are_no_borders():
+    assert borders.width(Config(particles=N)) == 0
+    assert borders.width(Config(particles=28, devices=4)) == 0
+    assert borders.width(Config(particles=N, devices=DEVICES)) == b
