@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam import borders, devices
-from jaxslam.listing import rounds
+from jaxslam.listing import listed, rounds
 
 CURRENT = -1
 TOGETHER = 2**18  # particles of all rows in one message
@@ -125,13 +125,16 @@ def resampled(ancestry, ancestors, wanted):
 
     There must be a chain that is not in use (`last_of`).
     """
-    free = jnp.argmin(_used(ancestry)).astype(jnp.int32)
-    chains = jax.lax.cond(
-        wanted,
-        lambda chains: chains[:, ancestors].at[free].set(ancestors),
-        lambda chains: chains,
-        ancestry.chains,
-    )
+    used = _used(ancestry)
+    free = jnp.argmin(used).astype(jnp.int32)
+
+    def follow(i, chains):
+        new = _row(chains, which[i]).at[ancestors].get(mode="promise_in_bounds")
+        return _put(chains, new, which[i])
+
+    which, count = listed(used)
+    chains = rounds(jnp.where(wanted, count, 0), follow, ancestry.chains)
+    chains = _put(chains, jnp.where(wanted, ancestors, _row(chains, free)), free)
     count = ancestry.count + wanted
     return Ancestry(
         chains=chains,
