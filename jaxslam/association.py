@@ -16,32 +16,34 @@ from jaxslam.listing import added, listed
 NEW, CLUTTER, PADDING = -1, -2, -3
 
 
-def associate(config, scorer, measurements, new, clutter, params, picks=None):
+def associate(config, scorer, measurements, new, clutter, params, picks=None, alike=None):
     """Slots [K, n] matched by the measurements, or `NEW`, `CLUTTER`, `PADDING`; and the log
     probability [n] with which they were drawn (0 where nothing is drawn).
 
     `scorer`: prediction of every slot, [M, n]. `new` [K] and `clutter` []: log densities of the
     alternatives (`clutter` -inf when the configuration has none). `picks` [K, n]: uniforms behind
     the draws of `sampled`, and of `known` between the identity's slot and clutter (None: the one of
-    greater density). No gradient flows through.
+    greater density). `alike` [K, M]: log likelihood ratios of looks, to be added, or None. No
+    gradient flows through.
     """
     scorer, new, clutter, params = stop_gradient((scorer, new, clutter, params))
     new = jnp.broadcast_to(new, measurements.valid.shape)
     log_choice = jnp.zeros_like(scorer.constant[0])
     if config.association == "sampled":
-        slot, log_choice = _sampled(config, scorer, measurements, new, clutter, params, picks)
+        given = measurements, new, clutter, params, picks, alike
+        slot, log_choice = _sampled(config, scorer, *given)
     elif config.association == "known":
         slot, log_choice = _known(config, scorer, measurements, clutter, params, picks)
     else:
         # Padding wants no landmark, so that it takes none from a measurement.
         threshold = jnp.where(measurements.valid, jnp.maximum(new, clutter), jnp.inf)
-        slot = _maximum_likelihood(config, scorer, measurements, threshold, params)
+        slot = _maximum_likelihood(config, scorer, measurements, threshold, params, alike)
         other = jnp.where(new >= clutter, NEW, CLUTTER)
         slot = jnp.where(slot < 0, other[:, None], slot)
     return jnp.where(measurements.valid[:, None], slot, PADDING), log_choice
 
 
-def _sampled(config, scorer, measurements, new, clutter, params, picks):
+def _sampled(config, scorer, measurements, new, clutter, params, picks, alike):
     """Slots [K, n] drawn one measurement after the other, and the log probability [n] of all.
 
     With `exclusive` a slot that an earlier measurement took has no share any more: drawn without
@@ -57,6 +59,8 @@ def _sampled(config, scorer, measurements, new, clutter, params, picks):
         table = score(
             config.sensor, scorer, tuple(v[k] for v in value), tuple(c[k] for c in cov), params
         )
+        if alike is not None:
+            table = table + alike[k][:, None]
         table = jnp.where(taken, -jnp.inf, table)
         top = jnp.maximum(table.max(0), jnp.maximum(new[k], clutter))
         share, other = jnp.exp(table - top), jnp.exp(new[k] - top)
@@ -124,20 +128,20 @@ def _decided(slot, there, occupied, density, clutter, picks):
     return jnp.where(there[:, None], slot, NEW), log_choice
 
 
-def _maximum_likelihood(config, scorer, measurements, threshold, params):
+def _maximum_likelihood(config, scorer, measurements, threshold, params, alike):
     """Best slot of each measurement, or -1; exclusive: the best pair first, over the frame."""
     lanes = scorer.constant.shape[1]
     start = (
         jnp.broadcast_to(threshold[:, None], (len(threshold), lanes)).astype(scorer.constant.dtype),
         jnp.full((len(threshold), lanes), -1, jnp.int32),
     )
-    possible = _possible(config, scorer, measurements, threshold)
+    possible = _possible(config, scorer, measurements, threshold, alike)
     pairs, count = listed(possible.reshape(-1))
 
     # A running "is it greater" is plain vector code on a CPU; argmax is not (ten times slower).
     def look(i, best):
         k, m = jnp.divmod(pairs[i], possible.shape[1])
-        density = _density(config, scorer, measurements, params, k, m)
+        density = _density(config, scorer, measurements, params, alike, k, m)
         held = jax.tree.map(lambda leaf: leaf[k], best)
         better = density > held[0]
         row = jnp.where(better, density, held[0]), jnp.where(better, m, held[1])
@@ -146,17 +150,18 @@ def _maximum_likelihood(config, scorer, measurements, threshold, params):
     best = jax.lax.fori_loop(0, count, look, start)
     if not config.exclusive:
         return best[1]
-    return _settle(config, scorer, measurements, threshold, params, best, possible)
+    return _settle(config, scorer, measurements, threshold, params, alike, best, possible)
 
 
-def _density(config, scorer, measurements, params, k, m):
+def _density(config, scorer, measurements, params, alike, k, m):
     """Log densities [n] of measurement k under slot m."""
     row = jax.tree.map(lambda leaf: leaf[m], scorer)
     value, cov = tuple(measurements.value[k]), tuple(measurements.cov[k])
-    return score(config.sensor, row, value, cov, params)
+    density = score(config.sensor, row, value, cov, params)
+    return density if alike is None else density + alike[k, m]
 
 
-def _possible(config, scorer, measurements, threshold):
+def _possible(config, scorer, measurements, threshold, alike=None):
     """Which slots some particle of the block might match with which measurements [K, M].
 
     A density is at most its normaliser's, less half the square of one component's innovation over
@@ -167,6 +172,8 @@ def _possible(config, scorer, measurements, threshold):
     upper = jnp.broadcast_to(scorer.constant.max(-1), (len(threshold), slots))
     if config.sensor == "position":  # its density has a part per measurement: only empty is sure
         upper = jnp.where(upper > -jnp.inf, jnp.inf, upper)
+    if alike is not None:
+        upper = upper + alike
     if config.sensor == "bearing":
         parts = [(0, scorer.matrix[0], True)]
     elif config.sensor == "range_bearing":
@@ -189,7 +196,7 @@ def _possible(config, scorer, measurements, threshold):
     return ~(upper - jnp.maximum(away, 0) <= threshold[:, None])
 
 
-def _settle(config, scorer, measurements, threshold, params, best, possible):
+def _settle(config, scorer, measurements, threshold, params, alike, best, possible):
     """Resolve measurements that chose the same slot: the loser goes on to its next best slot.
 
     Deferred acceptance (Gale and Shapley 1962). Both sides rank a pair by the same density, so the
@@ -224,7 +231,7 @@ def _settle(config, scorer, measurements, threshold, params, best, possible):
 
         def look(i, found):
             k, m = jnp.divmod(tried[i], slots)
-            table = _density(config, scorer, measurements, params, k, m)
+            table = _density(config, scorer, measurements, params, alike, k, m)
             further = (table < held[0]) | ((table == held[0]) & (m > held[1]))
             better = here[k] & further & (table > threshold[k]) & (table > found[0])
             return jnp.where(better, table, found[0]), jnp.where(better, m, found[1])

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam import devices
+from jaxslam.excerpt import corner
 from jaxslam.listing import pinned
 
 SHARE = 8  # of a device's particles one in so many belongs to a border
@@ -36,7 +37,7 @@ def of_slots(world, slots, config):
 
     def ends(leaf, slot):
         first, last = (
-            jax.lax.dynamic_slice(leaf, _corner(leaf, slot, start), (*leaf.shape[:-2], 1, b))
+            jax.lax.dynamic_slice(leaf, corner(leaf, slot, start), (*leaf.shape[:-2], 1, b))
             for start in (0, leaf.shape[-1] - b)
         )
         return jnp.concatenate([first, last], -1)
@@ -53,7 +54,7 @@ def put(leaf, border, slot, index, config):
     head, tail = own[:b], own[n - b :]
     rows = leaf.reshape(-1, *leaf.shape[-2:])
     for i, side in enumerate(border.reshape(-1, 2 * b)):
-        row = jax.lax.dynamic_slice(rows, _corner(rows, slot, 0, i), (1, 1, n))[0, 0]
+        row = jax.lax.dynamic_slice(rows, corner(rows, slot, 0, i), (1, 1, n))[0, 0]
         # Pinned: joined with what is put, reading would need a copy of the map.
         inside = pinned(_at(row, own, 0, n))
         parts = (
@@ -63,7 +64,7 @@ def put(leaf, border, slot, index, config):
         )
         for start, part in zip((0, 0, n - b), pinned(parts), strict=True):
             rows = jax.lax.dynamic_update_slice(
-                rows, part[None, None], _corner(rows, slot, start, i)
+                rows, part[None, None], corner(rows, slot, start, i)
             )
     return rows.reshape(leaf.shape)
 
@@ -71,9 +72,3 @@ def put(leaf, border, slot, index, config):
 def _at(row, index, low, high):
     """Of a row, what is at the indices; those out of [low, high) get anything."""
     return row.at[jnp.clip(index, low, high - 1)].get(mode="promise_in_bounds")
-
-
-def _corner(leaf, slot, start, *before):
-    """Where a slot's row begins; indices of one type, also in double precision."""
-    before = before or (0,) * (leaf.ndim - 2)
-    return tuple(jnp.asarray(i, jnp.int32) for i in (*before, slot, start))

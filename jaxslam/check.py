@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxslam.descriptors import space
 from jaxslam.log import NOT_USED
 
 MOST_SPEED = 5.0  # m/s
@@ -23,10 +24,10 @@ def check(log):
     """Findings on a log: counts, rates, gaps, lost rows, implausible units, truth against odometry.
 
     A `Log` that exists is already well formed (shapes, finite, stamps in order); this looks at what
-    its numbers mean. Pure NumPy.
+    its numbers mean. No JAX.
     """
     findings = [*_measurements(log), *_odometry(log), *_time(log), *_lost(log)]
-    findings += [*_view(log), *_identities(log), *_truth(log)]
+    findings += [*_view(log), *_identities(log), *_looks(log), *_truth(log)]
     return findings
 
 
@@ -156,6 +157,14 @@ def _identities(log):
     twice = len(pairs) - len(np.unique(pairs, axis=0))
     yield Finding("ok", f"{len(np.unique(log.identity[given]))} measured identities")
     yield _say(twice > 0, f"{twice} measurements repeat an identity of their frame")
+
+
+def _looks(log):
+    if log.descriptor is not None and len(log.frame):
+        found = len(space(log).within)
+        text = f"descriptors of {log.descriptor.shape[1]} columns: "
+        told = f"{found} coordinates tell landmarks apart" if found else "tell no landmarks apart"
+        yield Finding("ok", text + told)
 
 
 def _truth(log):

@@ -68,6 +68,7 @@ ASSOCIATED = "find out which landmark was measured, believe the log, or draw by 
 Association = option(Literal[ASSOCIATIONS], ASSOCIATED)
 Plain = Literal["maximum_likelihood", "known"]
 PROPOSED = "poses drawn from odometry, or informed by the measurements"
+LOOKS = "coordinates of looks that help to associate (bearings, hidden: all that tell; else 0)"
 REJUVENATED = "metres after which particles are redrawn (bearings, hidden: 3; else 0: never)"
 Proposal = option(Literal[PROPOSALS], PROPOSED) | None
 
@@ -96,6 +97,7 @@ def run(
     params: ParamFile = None,
     paper: Paper = False,
     rejuvenate: option(float, REJUVENATED) | None = None,
+    descriptors: whole(LOOKS, 0) | None = None,
     start: Start = 0.0,
     end: End = None,
     no_refine: option(bool, "only filter: path and map are not refined afterwards") = False,
@@ -136,7 +138,7 @@ def run(
     total = 1 if many else devices * (place.processes if place else 1)
     model = cli_run.model(
         loaded, sensor, association, particles, landmarks, params, paper, proposal, total,
-        rejuvenate,
+        rejuvenate, descriptors,
     )  # fmt: skip
     name = seed if seeds is None else f"seeds-{seeds}"
     out = out or Path("runs") / f"{Path(log).stem}-{model[0].sensor}-{name}"

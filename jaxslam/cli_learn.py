@@ -180,6 +180,7 @@ def _config(parts, sensor, association, particles, landmarks):
     # Else doubles of landmarks would pay, and noise be learnt too small.
     told = {"particles": particles, "even": association == "sampled"}
     told |= {"landmarks": landmarks} if landmarks else {}
+    told["descriptors"] = 0  # every part would have its own coordinates
     made = [config_for(part, sensor, association, proposal="informed", **told) for part in parts]
     config = dataclasses.replace(
         made[0],

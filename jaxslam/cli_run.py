@@ -43,7 +43,7 @@ class Task(NamedTuple):
 
 def model(
     log, sensor, association, particles, landmarks, params, paper, proposal=None, devices=1,
-    rejuvenate=None,
+    rejuvenate=None, descriptors=None,
 ):  # fmt: skip
     """`Config` and `Params` as the options say."""
     from jaxslam.config import Config, default_params
@@ -58,6 +58,10 @@ def model(
         )
     told = {"particles": particles, "landmarks": landmarks, "proposal": proposal}
     told = {name: value for name, value in told.items() if value}
+    if descriptors is not None:
+        if paper:
+            raise ValueError("--descriptors: the paper's rules (--paper) associate by place alone")
+        told["descriptors"] = descriptors
     config = config_for(log, sensor or ("position" if paper else None), association, **told)
     if paper:
         sizes = config.particles, config.landmarks, config.measurements

@@ -73,9 +73,9 @@ def compare(log, config, params=None, seed=0, steps=200, every=None, progress=No
 
     `every`: None to cover a tenth of the log, or as much as there is. `progress`: as for
     `agreement`, which is run in float64 and in float32. The baseline has no other proposal than
-    the prior, so both use that.
+    the prior and takes no notice of looks, so the filter does as it does.
     """
-    config = dataclasses.replace(config, proposal="prior", rejuvenate=0.0)
+    config = dataclasses.replace(config, proposal="prior", rejuvenate=0.0, descriptors=0)
     log = select(log, thinned(log, steps, every))
     double = agreement(log, config, params, seed, steps, True, progress)
     single = agreement(log, config, params, seed, steps, False, progress)

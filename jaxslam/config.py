@@ -30,7 +30,8 @@ class Config:
     looked at, with at most `chains` ancestries to keep; `devices`: how many share the particles,
     evenly. None of these four makes a difference to the result. `rejuvenate`: metres of driving
     after which a run's particles are redrawn from their refined past (`rejuvenation`; 0: never;
-    None: 3 for bearings whose identities are hidden, else never).
+    None: 3 for bearings whose identities are hidden, else never). `descriptors`: coordinates of a
+    measurement's looks that help to associate (`looks`; 0: none).
 
     Raises `ValueError` for a value that is not allowed.
     """
@@ -51,6 +52,7 @@ class Config:
     chains: int = 16
     devices: int = 1
     rejuvenate: float | None = None
+    descriptors: int = 0
 
     def __post_init__(self):
         for name, allowed in (
@@ -65,6 +67,11 @@ class Config:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"Config.{name}: {value!r} is not a whole number of at least 1")
+        looks = self.descriptors
+        if isinstance(looks, bool) or not isinstance(looks, int) or looks < 0:
+            raise ValueError(f"Config.descriptors: {looks!r} is not a whole number of at least 0")
+        if looks and self.association == "known":
+            raise ValueError("Config.descriptors: identities are known, so looks decide nothing")
         if self.particles % self.devices:
             even = self.particles // self.devices * self.devices
             raise ValueError(
@@ -110,6 +117,7 @@ class Config:
             forgetting=False,
             even=False,
             rejuvenate=0.0,
+            descriptors=0,
         )
         return cls(
             particles=particles,

@@ -15,18 +15,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import ancestry, births, devices, gate, landmarks, observation, resampling
+from jaxslam import ancestry, births, devices, gate, landmarks, looks, observation, resampling
 from jaxslam.ancestry import Ancestry
 from jaxslam.association import CLUTTER, NEW
 from jaxslam.geometry import wrap
 from jaxslam.landmarks import Landmarks
 from jaxslam.listing import pinned
+from jaxslam.looks import Looks
 from jaxslam.observation import Chance
+from jaxslam.weights import Estimate, estimated, weigh
 
 
 class State(NamedTuple):
     """What the next step needs: `pose` [3, N] (x, y, heading), the map, log weights [N], `step`;
-    bounds of the slots; and where landmarks are resampled lazily, what `settled` makes good."""
+    bounds of the slots; where landmarks are resampled lazily, what `settled` makes good; and how
+    landmarks look, where that is told."""
 
     pose: jax.Array
     landmarks: Landmarks
@@ -34,14 +37,7 @@ class State(NamedTuple):
     step: jax.Array
     bounds: gate.Bounds
     ancestry: Ancestry | None
-
-
-class Estimate(NamedTuple):
-    """Mean pose [3], its covariance [3, 3], and the particle of greatest weight."""
-
-    mean: jax.Array
-    cov: jax.Array
-    best: jax.Array
+    looks: Looks | None
 
 
 class Info(NamedTuple):
@@ -105,6 +101,7 @@ def fresh(pose, world, step, bounds, config):
         step=jnp.asarray(step, jnp.int32),
         bounds=bounds,
         ancestry=ancestry.new(config) if config.lazy and config.resample_threshold else None,
+        looks=looks.empty(config, pose.dtype),
     )
 
 
@@ -197,25 +194,33 @@ def _info_specs():
 def advance(chance, state, odometry, measurements, params, config):
     """`step` with its random numbers given: `chance` is that of `draws`."""
     seen = observation.observe(state, chance, odometry, measurements, params, config)
-    return conclude(chance, state, seen, measurements.active, config)
+    return conclude(chance, state, seen, measurements, config)
 
 
-def conclude(chance, state, seen, active, config):
+def conclude(chance, state, seen, measurements, config):
     """The second half of a step: weights of what was `seen` (`Observed`), estimate, resampling."""
     # Of all particles: every device works out the same from the same.
     pose, density, before = devices.whole((seen.pose, seen.density, state.log_weight), config)
     # A pose that is not a number fits nothing, which would count as new landmarks: no weight.
     sound = jnp.isfinite(pose).all(0)
     density = jnp.where(sound, density, jnp.nan)
-    log_weight, log_evidence, flags = _weigh(before, density)
+    log_weight, log_evidence, flags = weigh(before, density)
     weight = pinned(jnp.exp(log_weight))
-    estimate = _estimate(jnp.where(sound, pose, 0), weight)
+    estimate = estimated(jnp.where(sound, pose, 0), weight)
     ess = 1 / jnp.sum(weight**2)
     threshold = config.resample_threshold
-    wanted = active & ((ess < threshold * config.particles) | (threshold >= 1))
-    moved = State(pose, seen.landmarks, log_weight, state.step + 1, seen.bounds, seen.ancestry)
+    wanted = measurements.active & ((ess < threshold * config.particles) | (threshold >= 1))
+    match, birth = devices.one((seen.match, seen.birth), estimate.best, config)
+    moved = State(
+        pose,
+        seen.landmarks,
+        log_weight,
+        state.step + 1,
+        seen.bounds,
+        seen.ancestry,
+        None if seen.looks is None else looks.learnt(seen.looks, match, birth, measurements),
+    )
     resampled, ancestors = _resample(moved, wanted, chance.uniform, config)
-    match = devices.one(seen.match, estimate.best, config)
     overflow, forgotten, outliers = devices.total(
         jnp.stack([*seen.counts.sum(1), jnp.sum(seen.match == CLUTTER, dtype=jnp.int32)]), config
     )
@@ -249,32 +254,6 @@ def run(key, state, odometry, measurements, params, config, summarise=lambda inf
         return state, summarise(info)
 
     return jax.lax.scan(body, state, (odometry, measurements))
-
-
-def _weigh(log_weight, density):
-    """Normalised log weights, log evidence of the step, and flags (non-finite, degenerate)."""
-    raw = pinned(log_weight + density)
-    finite = jnp.isfinite(raw)
-    # A particle that already had no weight is not news.
-    nonfinite = jnp.sum(~finite & (log_weight > -jnp.inf))
-    degenerate = ~finite.any()
-    log_evidence = jax.nn.logsumexp(jnp.where(finite, raw, -jnp.inf))
-    even = jnp.full_like(raw, -jnp.log(len(raw)))
-    normalised = jnp.where(finite, raw - log_evidence, -jnp.inf)
-    log_weight = pinned(jnp.where(degenerate, even, normalised))
-    return log_weight, log_evidence, (nonfinite, degenerate)
-
-
-def _estimate(pose, weight):
-    """Weighted mean (circular in heading) and covariance of the poses, and the heaviest one."""
-    # Sums, not matrix products: how these add up depends on the number of threads.
-    x, y, heading = pose
-    parts = jnp.stack([x, y, jnp.sin(heading), jnp.cos(heading)])
-    x_mean, y_mean, s, c = pinned(parts * weight).sum(1)
-    mean = jnp.stack([x_mean, y_mean, jnp.arctan2(s, c)])
-    off = pinned(jnp.stack([x - mean[0], y - mean[1], wrap(heading - mean[2])]))
-    cov = pinned(off[:, None] * (off * weight)).sum(2)
-    return Estimate(mean, cov, jnp.argmax(weight))
 
 
 def _resample(state, wanted, uniform, config):

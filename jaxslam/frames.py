@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.config import default_params
+from jaxslam.descriptors import space
 from jaxslam.odometry import Odometry, increments
 from jaxslam.sensors import Measurements
 
@@ -22,13 +23,14 @@ class Frames(NamedTuple):
     dropped: dict[str, int]
 
 
-def frames(log, sensor, measurements=None, params=None, known=False):
+def frames(log, sensor, measurements=None, params=None, known=False, descriptors=0):
     """`Frames` of a log for one sensor.
 
     `measurements`: slots per frame (None: as many as the fullest frame needs); beyond them the
     farthest are dropped, or the last where there is no range. `params` gives the noise when
     positions are made of ranges and bearings. `known`: hand over the measured identities; otherwise
-    they are hidden. Raises `ValueError` when the log can't supply what is asked.
+    they are hidden. `descriptors`: coordinates of their looks handed over. Raises
+    `ValueError` when the log can't supply what is asked.
     """
     if not log.has(sensor):
         has = [name for name in ("position", "range_bearing", "bearing") if log.has(name)]
@@ -57,6 +59,7 @@ def frames(log, sensor, measurements=None, params=None, known=False):
             identity=np.append(identity, -1)[row].astype(np.int32),
             valid=row >= 0,
             active=np.ones(len(row), bool),
+            **_looks(log, descriptors, row),
         ),
         identities=identities,
         row=row,
@@ -80,6 +83,20 @@ def _values(log, sensor, params):
     xy = c * s * (along - across)
     cov = np.column_stack([c**2 * along + s**2 * across, xy, s**2 * along + c**2 * across])
     return np.column_stack([r * c, r * s]), cov, r
+
+
+def _looks(log, size, row):
+    """`Measurements.descriptor` [T, K, J] and `within` [T, J] of the slots' rows."""
+    if not size:
+        return {}
+    found = space(log)
+    if len(found.within) < size:
+        raise ValueError(
+            f"{log.name}: {size} descriptors are asked for, but {len(found.within)} tell landmarks "
+            "apart in this log"
+        )
+    coordinates = np.vstack([found.coordinates[:, :size], np.zeros((1, size))])
+    return dict(descriptor=coordinates[row], within=np.tile(found.within[:size], (len(row), 1)))
 
 
 def _scale(log, sensor, row):

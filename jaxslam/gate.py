@@ -77,7 +77,7 @@ def unlimited(bounds, born):
     )
 
 
-def concerned(config, bounds, sensor_pose, measurements, params, extra):
+def concerned(config, bounds, sensor_pose, measurements, alike, params, extra):
     """Slots [M] that some particle's look may concern.
 
     `known`: those named, and if landmarks are forgotten all that may be in view. Bearings alone
@@ -85,7 +85,8 @@ def concerned(config, bounds, sensor_pose, measurements, params, extra):
     positions under the informed proposal). Else those that
     some particle may have in view or match. A density is at most the normaliser of the
     measurement's own noise, less half the square of the range's innovation over its variance.
-    `extra`: variance that the pose adds to a range, at most.
+    `alike` [K, M]: log likelihood ratios of looks, or None. `extra`: variance that the pose adds to
+    a range, at most.
     """
     used = bounds.used
     if config.landmarks <= FEW and config.association != "known":
@@ -121,6 +122,8 @@ def concerned(config, bounds, sensor_pose, measurements, params, extra):
     beyond = jnp.maximum(nearest - far[:, None], 0.0)
     variance = jnp.broadcast_to(variance, far.shape)[:, None] + bounds.spread + extra
     bound = jnp.broadcast_to(top, far.shape)[:, None] - 0.499 * beyond**2 / variance
+    if alike is not None:
+        bound = bound + alike
     matches = ~(bound <= threshold[:, None]) & measurements.valid[:, None]
     return used & (concerns | matches.any(0))
 

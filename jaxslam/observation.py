@@ -14,9 +14,11 @@ from jaxslam import (
     ancestry,
     association,
     births,
+    excerpt,
     gate,
     geometry,
     landmarks,
+    looks,
     matched,
     motion,
     proposal,
@@ -26,6 +28,7 @@ from jaxslam.ancestry import Ancestry
 from jaxslam.association import CLUTTER, NEW
 from jaxslam.landmarks import Landmarks
 from jaxslam.listing import added, listed, once, pinned, rounds
+from jaxslam.looks import Looks
 
 SWEEP = 16  # steps
 SMALLEST = gate.FEW  # slots of which a block takes copies; four times as many, and so on, or all
@@ -57,6 +60,7 @@ class Observed(NamedTuple):
     u: jax.Array
     bounds: gate.Bounds | None = None
     ancestry: Ancestry | None = None
+    looks: Looks | None = None
 
 
 def observe(state, chance, odometry, measurements, params, config, frozen=False):
@@ -82,12 +86,13 @@ def observe(state, chance, odometry, measurements, params, config, frozen=False)
     predicted = pinned(hold(jnp.stack(predicted)))
     sensor_pose = once(sure, lambda: sensors.pose_of(tuple(predicted), params))
     sensor_pose = pinned(jnp.stack(sensor_pose))
-    rows = _concerned(state, predicted, sensor_pose, odometry, measurements, params, config)
+    alike = None if state.looks is None else looks.gain(state.looks, measurements)
+    rows = _concerned(state, predicted, sensor_pose, odometry, measurements, alike, params, config)
     rows &= measurements.active
     world, past, rows = _caught_up(state, rows, config)
     free = jnp.nonzero(~state.bounds.used, size=config.measurements, fill_value=config.landmarks)[0]
     particles = pose, predicted, sensor_pose, chance.normals, chance.picks
-    frame = odometry, measurements, params, free, state.step
+    frame = odometry, measurements, alike, params, free, state.step
     match = jnp.full((config.measurements, n), association.PADDING, jnp.int32)
     zero = jnp.zeros(n, pose.dtype)
     counts = jnp.zeros((2, n), jnp.int32)
@@ -101,21 +106,24 @@ def observe(state, chance, odometry, measurements, params, config, frozen=False)
         past = past._replace(
             chain=jnp.where(found.used & ~state.bounds.used, ancestry.CURRENT, past.chain)
         )
+    looked = state.looks
+    if looked is not None:
+        looked = looks.without(looked, found.used & ~state.bounds.used)
     touched = rows | found.used
     if matched.by_name(config):  # no bounds are asked for
         bounds = gate.unlimited(state.bounds, found.used | (rows & state.bounds.used))
     else:
         bounds = jax.tree.map(lambda new, old: jnp.where(touched, new, old), found, state.bounds)
-    return seen._replace(bounds=bounds, ancestry=past)
+    return seen._replace(bounds=bounds, ancestry=past, looks=looked)
 
 
-def _concerned(state, predicted, sensor_pose, odometry, measurements, params, config):
+def _concerned(state, predicted, sensor_pose, odometry, measurements, alike, params, config):
     """Slots [M] to look at."""
     extra = 0.0
     if config.proposal == "informed":
         axes = proposal.axes(state.pose, predicted, sensor_pose, odometry, params)
         extra = jnp.max(sum(x * x + y * y for x, y, _ in axes))
-    given = state.bounds, sensor_pose, measurements, params, extra
+    given = state.bounds, sensor_pose, measurements, alike, params, extra
     return gate.concerned(config, *jax.lax.stop_gradient(given))
 
 
@@ -166,7 +174,7 @@ def _widths(n, most):
 def _blocks(whole, particles, rows, frame, config, hold, size, chosen):
     """`Observed` of all particles, each with `size` of the slots, if that is `chosen`."""
     total = len(rows)
-    odometry, measurements, params, free, number = frame
+    odometry, measurements, alike, params, free, number = frame
     named = measurements
     slots = jnp.arange(total, dtype=jnp.int32)
     own, taken = None, None if size == total else (slots[:size], rows.sum())
@@ -176,7 +184,9 @@ def _blocks(whole, particles, rows, frame, config, hold, size, chosen):
         slots, taken, put = own.slot, listed(own.there), listed(own.there & (own.earlier == 0))
     elif size < total:
         slots = jnp.nonzero(rows, size=size, fill_value=total)[0].astype(jnp.int32)
-        measurements = _renamed(measurements, slots, total)
+        measurements = excerpt.renamed(measurements, slots, total)
+        if alike is not None:
+            alike = jnp.pad(alike, ((0, 0), (0, 1)))[:, slots]
 
     def block(i, carry, first, width):
         carry, bounds = carry
@@ -184,12 +194,12 @@ def _blocks(whole, particles, rows, frame, config, hold, size, chosen):
         mine = jax.tree.map(
             lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, width, -1), particles
         )
-        before = _taken(carry.landmarks, slots, taken, start, width)
+        before = excerpt.taken(carry.landmarks, slots, taken, start, width)
         # Inside a branch the slices are arrays of their own. Fused into the arithmetic, in-place
         # reading and writing of the large arrays stops its vectorisation: ten times slower.
         done = jax.lax.cond(
             measurements.active,
-            lambda *mine: _look(*mine, own, odometry, measurements, params, config, hold),
+            lambda *mine: _look(*mine, own, odometry, measurements, alike, params, config, hold),
             lambda *mine: _nothing(*mine, odometry, params, config, hold),
             mine,
             before,
@@ -203,7 +213,7 @@ def _blocks(whole, particles, rows, frame, config, hold, size, chosen):
             done._replace(landmarks=None),
         )
         fixed = dict(anchor=None, birth=None)  # what a look leaves as it is
-        world = _put(
+        world = excerpt.put(
             carry.landmarks._replace(**fixed), done.landmarks._replace(**fixed), slots, put, start,
         )._replace(anchor=carry.landmarks.anchor, birth=carry.landmarks.birth)  # fmt: skip
         at = tuple(sensors.pose_of(tuple(done.pose), params))
@@ -223,69 +233,6 @@ def _blocks(whole, particles, rows, frame, config, hold, size, chosen):
     return whole
 
 
-def _renamed(measurements, slots, total):
-    """The measurements with the places of their slots among `slots` [S] as identities; S: none."""
-    size, given = len(slots), measurements.identity
-    local = jnp.full(total, size, jnp.int32)
-    local = local.at[slots].set(jnp.arange(size, dtype=jnp.int32), mode="drop")
-    there = (given >= 0) & (given < total)
-    identity = jnp.where(there, local[jnp.clip(given, 0, total - 1)], size)
-    return measurements._replace(identity=identity)
-
-
-def _taken(world, slots, rows, start, width):
-    """Of `slots` [S] the `rows` listed (indices, and how many), of `width` particles from `start`
-    on; the others are empty. None: all slots."""
-    if rows is None:
-        return jax.tree.map(
-            lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, width, -1),
-            world,
-        )
-
-    which, count = rows
-
-    def one(i, parts):
-        def take(leaf, part):
-            at = _corner(leaf, slots[which[i]], start)
-            row = jax.lax.dynamic_slice(leaf, at, (*leaf.shape[:-2], 1, width))
-            return jax.lax.dynamic_update_slice_in_dim(part, row, which[i], leaf.ndim - 2)
-
-        return jax.tree.map(take, world, parts)
-
-    empty = jax.tree.map(
-        lambda leaf: jnp.zeros((*leaf.shape[:-2], len(slots), width), leaf.dtype),
-        world,
-    )
-    return rounds(count, one, empty)
-
-
-def _corner(leaf, slot, start):
-    """Where a block's row begins; indices of one type, also in double precision."""
-    return tuple(jnp.asarray(i, jnp.int32) for i in (*(0,) * (leaf.ndim - 2), slot, start))
-
-
-def _put(world, part, slots, rows, start):
-    """The map with what `_taken` took replaced."""
-    if rows is None:
-        return jax.tree.map(
-            lambda leaf, new: jax.lax.dynamic_update_slice_in_dim(leaf, new, start, -1),
-            world,
-            part,
-        )
-
-    which, count = rows
-
-    def one(i, leaves):
-        def put(leaf, new):
-            row = jax.lax.dynamic_slice_in_dim(new, which[i], 1, new.ndim - 2)
-            at = _corner(leaf, slots[which[i]], start)
-            return jax.lax.dynamic_update_slice(leaf, row, at)
-
-        return jax.tree.map(put, leaves, part)
-
-    return rounds(count, one, world)
-
-
 def _nothing(particles, before, odometry, params, config, hold):
     """`Observed` in a frame without a look: it moves."""
     pose, predicted, _, normals, _ = particles
@@ -298,10 +245,11 @@ def _nothing(particles, before, odometry, params, config, hold):
     return Observed(predicted, before, zero, match, match, zero, counts, normals)
 
 
-def _look(particles, before, rows, odometry, measurements, params, config, hold):
+def _look(particles, before, rows, odometry, measurements, alike, params, config, hold):
     """`Observed`: associate, move (when informed), weigh and update, forget.
 
-    `rows`: `matched.Rows` where these are the landmarks `before`, else None.
+    `rows`: `matched.Rows` where these are the landmarks `before`, else None. `alike` [K, M]: log
+    likelihood ratios of looks, or None.
     """
     pose, predicted, sensor_pose, normals, picks = particles
     sensor, informed = config.sensor, config.proposal == "informed"
@@ -319,7 +267,7 @@ def _look(particles, before, rows, odometry, measurements, params, config, hold)
     clutter = sensors.log_clutter_density(sensor, params)
     if rows is None:
         match, log_choice = association.associate(
-            config, scorer, measurements, new, clutter, params, picks
+            config, scorer, measurements, new, clutter, params, picks, alike
         )
     else:
         fit = _fit(sensor, sensor_pose, before, rows, measurements, noise)
@@ -348,6 +296,9 @@ def _look(particles, before, rows, odometry, measurements, params, config, hold)
             sensor, tuple(sensor_pose), before, rows, match, measurements, noise, fit
         )
     density = _with_unmatched(config, density, match, new, clutter, count)
+    if alike is not None:
+        own = jnp.take_along_axis(alike, jnp.maximum(match, 0), 1)
+        density = density + added(jnp.where(match >= 0, own, 0.0))
     forgotten = jnp.zeros_like(match[0])
     if config.forgetting:
         world, forgotten = landmarks.existence(world, seen, params)

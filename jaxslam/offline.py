@@ -48,7 +48,10 @@ def seconds(text):
 
 def memory(config, steps=1000):
     """`capacity.Memory` that a run of so many steps needs: compiled for it, nothing large made."""
-    size, k = runner.chunk_size(config), config.measurements
+    size, k, looks = runner.chunk_size(config), config.measurements, {}
+    if config.descriptors:
+        looks["descriptor"] = jnp.zeros((size, k, config.descriptors))
+        looks["within"] = jnp.zeros((size, config.descriptors))
     zero = jnp.zeros(size)
     chunk = (
         Odometry(*[zero] * len(Odometry._fields)),
@@ -58,6 +61,7 @@ def memory(config, steps=1000):
             identity=jnp.zeros((size, k), jnp.int32),
             valid=jnp.zeros((size, k), bool),
             active=jnp.zeros(size, bool),
+            **looks,
         ),
     )
     params = jax.tree.map(jnp.asarray, default_params(config.sensor))

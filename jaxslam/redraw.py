@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import cho_solve_banded
 
-from jaxslam import gate, landmarks
+from jaxslam import gate, landmarks, looks
 from jaxslam.filter import fresh, made
 from jaxslam.geometry import norm, wrap
 from jaxslam.listing import pinned
@@ -92,13 +92,14 @@ def root_of(cov):
     return vectors * np.sqrt(np.maximum(values, 0))
 
 
-def drawn(key, joint, step, config):
-    """`State` at `step`: N particles of equal weight drawn from a `Joint`."""
-    return made(_drawn, config, key, joint, jnp.int32(step))
+def drawn(key, joint, step, config, known=None):
+    """`State` at `step`: N particles of equal weight drawn from a `Joint`; `known`: `looks.Looks`
+    of the state before, or None."""
+    return made(_drawn, config, key, joint, jnp.int32(step), known)
 
 
 @partial(jax.jit, static_argnames="config")
-def _drawn(key, joint, step, config):
+def _drawn(key, joint, step, known, config):
     n, slots = config.particles, config.landmarks
     key = jax.random.fold_in(jax.random.fold_in(key, STREAM), step)
 
@@ -111,7 +112,8 @@ def _drawn(key, joint, step, config):
     pose = joint.pose[:, None] + off[:3]
     pose = pinned(pose.at[2].set(wrap(pose[2])))
     world = _map(joint, pose, off[3:].reshape(slots, 2, n), config)
-    return fresh(pose, world, step, gate.of_rows(world), config)
+    state = fresh(pose, world, step, gate.of_rows(world), config)
+    return state if known is None else state._replace(looks=looks.moved(known, joint.birth))
 
 
 def _map(joint, pose, off, config):

@@ -86,9 +86,10 @@ class Rejuvenation:
         joint = devices.told(joint)
         if joint.used == 0:
             return state, past, None
-        for leaf in jax.tree.leaves(state):  # no two maps at once
+        looks = state.looks
+        for leaf in jax.tree.leaves(state._replace(looks=None)):  # no two maps at once
             leaf.delete()
-        return redraw.drawn(key, joint, done, self._config), past, lost
+        return redraw.drawn(key, joint, done, self._config, looks), past, lost
 
     def _looked_back(self, past, lineage, done, young):
         """The new `Past`, `redraw.Joint` and how many landmarks it has no slot for."""

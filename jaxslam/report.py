@@ -216,6 +216,7 @@ def summarise(result):
         "sensor": config.sensor,
         "association": config.association,
         "proposal": config.proposal,
+        "descriptors": config.descriptors,
         "seed": result.seed,
         "n_particles": config.particles,
         "n_steps": len(result.time),

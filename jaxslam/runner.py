@@ -13,6 +13,7 @@ from jaxslam import capacity, devices
 from jaxslam import filter as fastslam
 from jaxslam.ambiguity import entropy
 from jaxslam.config import Config, default_params
+from jaxslam.descriptors import space
 from jaxslam.frames import frames
 from jaxslam.outcome import Filtered, Leaves, Summary, identity_of, origin_of, result_of, settled
 from jaxslam.paramfile import validate
@@ -27,7 +28,8 @@ TREE_BYTES = 2**31  # what the genealogy may take; beyond that it is given up
 def config_for(log, sensor=None, association="maximum_likelihood", **settings):
     """A `Config` whose sensor and sizes fit the log; `settings` are further `Config` fields.
 
-    Hidden bearings get the informed proposal unless told otherwise.
+    Hidden bearings get the informed proposal unless told otherwise, and looks help to associate
+    them as far as the log's descriptors tell landmarks apart.
     """
     if sensor is None:
         sensor = next(s for s in ("range_bearing", "position", "bearing") if log.has(s))
@@ -36,6 +38,8 @@ def config_for(log, sensor=None, association="maximum_likelihood", **settings):
         settings.setdefault("landmarks", max(1, len(np.unique(log.identity[log.identity >= 0]))))
     if sensor == "bearing" and association == "maximum_likelihood":
         settings.setdefault("proposal", "informed")
+    if sensor == "bearing" and association != "known" and "descriptors" not in settings:
+        settings["descriptors"] = len(space(log).within)
     return Config(sensor=sensor, association=association, **settings)
 
 
@@ -114,7 +118,8 @@ def refined(result, progress=None):
 def framed(log, config, params):
     """`Frames` of a log, as a configuration asks for them."""
     known = config.association == "known"
-    return frames(log, config.sensor, config.measurements, params, known)
+    sizes = config.measurements, params, known, config.descriptors
+    return frames(log, config.sensor, *sizes)
 
 
 def shapes(config):

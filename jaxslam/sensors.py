@@ -30,7 +30,8 @@ class Measurements(NamedTuple):
     `value` [K, 2]: (range, bearing), (x, y) or (bearing, 0). `cov` [K, 3]: (xx, xy, yy) of a
     position, else zero. `identity` [K]: index of a measured identity, -1 if none. `valid` [K].
     `active` []: whether the sensor looked at all. `scale` [K]: 1 where a position's size rests on
-    odometry, else 0; None: nowhere.
+    odometry, else 0; None: nowhere. `descriptor` [K, J] and `within` [J]: looks and their variance
+    for one landmark (`looks.Space`); None: there are none.
     """
 
     value: jax.Array
@@ -39,6 +40,8 @@ class Measurements(NamedTuple):
     valid: jax.Array
     active: jax.Array
     scale: jax.Array | None = None
+    descriptor: jax.Array | None = None
+    within: jax.Array | None = None
 
 
 class Seen(NamedTuple):

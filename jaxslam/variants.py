@@ -47,14 +47,14 @@ def variants(log, config, params=None, seed=0, steps=200, every=None, baselines=
 
 
 def _rules(config):
-    """`Config` by name."""
+    """`Config` by name; none takes notice of looks, as the baseline does not."""
     # The paper measures positions; bearings alone do not make one.
     sensor = "bearing" if config.sensor == "bearing" else "position"
     sizes = config.particles, config.landmarks, config.measurements
     return {
         "Config.paper()": Config.paper(*sizes, sensor=sensor, association=config.association),
-        "FastSLAM 1.0": replace(config, proposal="prior", rejuvenate=0.0),
-        "informed": replace(config, proposal="informed", rejuvenate=0.0),
+        "FastSLAM 1.0": replace(config, proposal="prior", rejuvenate=0.0, descriptors=0),
+        "informed": replace(config, proposal="informed", rejuvenate=0.0, descriptors=0),
     }
 
 

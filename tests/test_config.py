@@ -50,6 +50,7 @@ def test_defaults():
         "proposal": "prior",
         "even": False,
         "rejuvenate": 0.0,
+        "descriptors": 0,
     }
 
 
@@ -83,6 +84,7 @@ def test_the_papers_preset_field_by_field():
         "proposal": "prior",
         "even": False,
         "rejuvenate": 0.0,
+        "descriptors": 0,
     }
     assert Config.paper(particles=10, landmarks=3, measurements=2) == Config(
         sensor="position",

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import jax
 import pytest
+from test_looks import coloured
 
 from jaxslam import cli, hosts, offline
 from jaxslam.config import Config, default_params
@@ -66,7 +67,8 @@ def bits(path, settings, changes):
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
     path = tmp_path_factory.mktemp("short") / "log.npz"
-    save_log(path, planar("field", 5, landmarks=25, length_m=6.0, rate_hz=2.0, outlier=0.05))
+    log = planar("field", 5, landmarks=25, length_m=6.0, rate_hz=2.0, outlier=0.05)
+    save_log(path, coloured(log))
     return path
 
 
@@ -82,6 +84,7 @@ def test_devices_make_no_difference(short):
 @pytest.mark.slow
 def test_rejuvenation_is_the_same_on_devices(short):
     settings = dict(sensor="bearing", particles=504, block=100, landmarks=40, rejuvenate=1.5)
+    settings["descriptors"] = 1
     lines = bits(short, settings, [dict(), dict(devices=2, chunk=7)])
     assert len({line[0] for line in lines}) == 1
     assert int(lines[0][2]) >= 3

@@ -13,6 +13,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from test_looks import coloured
 
 from jaxslam import checkpoint, cli, lock, offline, report, runner
 from jaxslam.config import default_params
@@ -27,7 +28,7 @@ LONG = *RUN, "--out", "out", "--checkpoint-every", "0.001"
 
 @pytest.fixture(scope="module")
 def log():
-    return planar("field", 5, landmarks=25, length_m=6.0, rate_hz=2.0, outlier=0.05)
+    return coloured(planar("field", 5, landmarks=25, length_m=6.0, rate_hz=2.0, outlier=0.05))
 
 
 @pytest.fixture
@@ -95,6 +96,18 @@ def test_a_resumed_run_is_bit_for_bit_the_undisturbed_one(log, tmp_path, monkeyp
     # The end was put aside as well: nothing is filtered or compiled again.
     monkeypatch.setattr(runner, "compiled", None)
     same(columns(gone_on(log, config, folder)), whole)
+
+
+@pytest.mark.slow
+def test_looks_and_particles_drawn_anew_are_gone_on_with_bit_for_bit(log, tmp_path, monkeypatch):
+    settings = dict(sensor="bearing", descriptors=1, rejuvenate=1.5)
+    config = config_for(log, particles=30, landmarks=30, **settings)
+    whole = runner.run(log, config, None, 3, refine=False)
+    assert whole.events is not None
+    monkeypatch.setattr(runner, "CHUNK", 1)
+    broken_off(log, config, tmp_path / "run", 5)
+    broken_off(log, config, tmp_path / "run", 4, resume=True)
+    same(columns(gone_on(log, config, tmp_path / "run")), columns(whole))
 
 
 def test_a_genealogy_that_was_given_up_stays_so(log, tmp_path, monkeypatch):
