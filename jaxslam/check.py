@@ -4,12 +4,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxslam import clocks
 from jaxslam.descriptors import space
 from jaxslam.log import NOT_USED
 
 MOST_SPEED = 5.0  # m/s
 MOST_YAW_RATE = 10.0  # rad/s
 MOST_RANGE = 1000.0  # m
+MOST_OFFSET_S = 0.25
+SAME_CLOCK_S = 0.03  # within what parallax makes of it
 LONG_RUN_S = 7 * 86400.0
 MOST_RATE_HZ = 1e5
 LEVELS = ("ok", "warning", "error")
@@ -26,7 +29,7 @@ def check(log):
     A `Log` that exists is already well formed (shapes, finite, stamps in order); this looks at what
     its numbers mean. No JAX.
     """
-    findings = [*_measurements(log), *_odometry(log), *_time(log), *_lost(log)]
+    findings = [*_measurements(log), *_odometry(log), *_time(log), *_clocks(log), *_lost(log)]
     findings += [*_view(log), *_identities(log), *_looks(log), *_truth(log)]
     return findings
 
@@ -112,6 +115,17 @@ def _time(log):
         text = f"{what}: usual step {usual:.3f} s, longest gap {longest:.3f} s"
         place = f" at {since - log.start / 1e9:.1f} s" if longest > 0 else ""
         yield _say(longest > max(long, 10 * usual), text + place)
+
+
+def _clocks(log):
+    found = clocks.offset(log)
+    if found is not None:
+        text = "frames fit the odometry's turning best as stamped"
+        if abs(found.seconds) > SAME_CLOCK_S:
+            text = f"frames fit the odometry's turning best when moved by {found.seconds:.2f} s"
+        text += f" ({found.least:.2f} to {found.most:.2f} s by parts of the log)"
+        hint = ": one clock is late? jaxslam convert LOG OUT.npz --time-offset S moves frames"
+        yield _say(abs(found.seconds) > MOST_OFFSET_S, text, hint=hint)
 
 
 def _gaps(time):

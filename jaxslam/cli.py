@@ -208,15 +208,18 @@ def compare(
 def convert(
     *paths: option(Path, "files or folder to read, then the log to write"),
     robot: whole("which robot of an MRCLAM folder") | None = None,
+    time_offset: option(float, "seconds to move the frames by, as check says") = 0.0,
     overwrite: Overwrite = False,
 ):
     """Make a log of other people's files; their format is guessed.
 
     The course's dataset2.mat, an MRCLAM folder (with --robot), or two to four
-    .csv files: odometry, measurements, and true poses and landmarks if known.
+    .csv files: odometry, measurements, and true poses and landmarks if known;
+    or a log, to move its frames (--time-offset).
 
     Example: jaxslam convert odometry.csv measurements.csv OUT.npz
     """
+    from jaxslam.clocks import moved
     from jaxslam.log import NOT_USED, save_log
     from jaxslam.readers import read
 
@@ -225,7 +228,7 @@ def convert(
     *sources, out = paths
     check_new(out, overwrite)
     with bar("reading"):
-        log = read(sources, robot)
+        log = moved(read(sources, robot), time_offset)
     save_log(out, log)
     print(f"{out}: {log}; look at it with: jaxslam check {out}")
     lost = {why: n for why, n in log.skipped.items() if not why.startswith(NOT_USED)}

@@ -44,12 +44,19 @@ def space(log):
         return nothing
     mean = np.stack([np.bincount(track[inside], c) for c in x[inside].T], 1) / size[:, None]
     off = x[inside] - mean[track[inside]]
-    own = off.T @ off / (inside.sum() - len(size))
-    whole = x.T @ x / len(x)
+    own = _products(off.T, off) / (inside.sum() - len(size))
+    whole = _products(x.T, x) / len(x)
     value, vector = eigh(own, whole + 1e-9 * np.eye(len(whole)))
     kept = np.flatnonzero(value < USEFUL)[:MOST]
+    # Rounded, so that all machines of a run have the same.
+    coordinates = np.round(_products(x, vector[:, kept]), 4)
     # Links last a few frames, in which light and background change less than over a log.
-    return Space(x @ vector[:, kept], np.sqrt(np.maximum(value[kept], 1e-4)))
+    return Space(coordinates, np.round(np.sqrt(np.maximum(value[kept], 1e-4)), 4))
+
+
+def _products(a, b):
+    """Matrix product that does not depend on the number of threads, as that of a BLAS does."""
+    return np.einsum("ij,jk->ik", a, b)
 
 
 def _tracks(log):

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from jaxslam.log import BUNDLED, load_log
 from jaxslam.readers.csvpair import read_csv
 from jaxslam.readers.mat import read_mat
 from jaxslam.readers.mrclam import read_mrclam
@@ -11,14 +12,15 @@ def read(paths, robot=None):
     """`Log` of a foreign file, folder or list of files, whose format is guessed.
 
     A `.mat` is the course's, a folder with `Barcodes.dat` MRCLAM's (`robot`: its number), and two
-    to four `.csv` files are odometry, measurements, truth and landmarks, in any order. Raises
-    `ValueError` naming the file and what is wrong.
+    to four `.csv` files are odometry, measurements, truth and landmarks, in any order; a `.npz`, or
+    the name of a bundled log, is a log already. Raises `ValueError` naming the file and what is
+    wrong.
     """
     paths = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     if not paths:
         raise ValueError("nothing to read: give a .mat file, an MRCLAM folder or two .csv files")
     for path in paths:
-        if not path.exists():
+        if not path.exists() and str(path) not in BUNDLED:
             raise ValueError(f"{path}: no such file or folder")
     try:
         return _read(paths, robot)
@@ -39,6 +41,8 @@ def _read(paths, robot):
         return read_mat(paths[0])
     if all(path.suffix.lower() == ".csv" for path in paths):
         return read_csv(paths)
-    allowed = "one .mat file, one MRCLAM folder (with Barcodes.dat), or two to four .csv files"
+    if len(paths) == 1 and (paths[0].suffix.lower() == ".npz" or str(paths[0]) in BUNDLED):
+        return load_log(paths[0])
+    allowed = "one .mat file or .npz log, one MRCLAM folder (with Barcodes.dat), or two to four .csv"
     listed = ", ".join(str(path) for path in paths)
     raise ValueError(f"{listed}: format not known; give {allowed}")
