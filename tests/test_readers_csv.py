@@ -60,6 +60,33 @@ def test_csv_commands_and_points(tmp_path):
     assert log.frame.tolist() == [0]
 
 
+def test_csv_looks_become_descriptors(tmp_path):
+    measured = (
+        "time_s,bearing_rad,identity,look_red,look_top\n"
+        "0.5,0.1,7,0.25,-3\n0.75,,,,\n1.0,0.2,,0.5,4\n"
+    )
+    log = read(csv(tmp_path, measured=measured))
+    assert log.descriptor.tolist() == [[0.25, -3], [0.5, 4]]
+    assert log.identity.tolist() == [7, -1]
+    assert log.frame.tolist() == [0, 2]
+    assert read(csv(tmp_path)).descriptor is None
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "time_s,look_red,bearing_rad",  # before what was measured
+        "time_s,bearing_rad,look_red,identity",
+        "time_s,bearing_rad,look_red,look_red",
+        "time_s,x_m,y_m,theta_rad,look_red",  # of the truth
+    ],
+)
+def test_csv_looks_anywhere_else_are_refused(tmp_path, header):
+    row = ",".join("1" for _ in header.split(","))
+    with pytest.raises(ValueError, match=r"measured\.csv, line 1: .* is no known header"):
+        read(csv(tmp_path, measured=f"{header}\n{row}\n"))
+
+
 def test_csv_bearings_alone_see_ten_metres(tmp_path):
     measured = "time_s,bearing_rad\n0.5,-0.5\n0.5,0.5\n"
     paths = csv(tmp_path, measured=measured)

@@ -43,6 +43,6 @@ def _read(paths, robot):
         return read_csv(paths)
     if len(paths) == 1 and (paths[0].suffix.lower() == ".npz" or str(paths[0]) in BUNDLED):
         return load_log(paths[0])
-    allowed = "one .mat file or .npz log, one MRCLAM folder (with Barcodes.dat), or two to four .csv"
+    allowed = "a .mat file, a .npz log, an MRCLAM folder (with Barcodes.dat), or two to four .csv"
     listed = ", ".join(str(path) for path in paths)
     raise ValueError(f"{listed}: format not known; give {allowed}")

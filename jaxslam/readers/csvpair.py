@@ -9,8 +9,9 @@ measurements  time_s,bearing_rad[,range_m][,identity]
 truth         time_s,x_m,y_m,theta_rad
 landmarks     id,x_m,y_m                          true landmarks
 
-Rows of one stamp are one frame; a row with nothing but its stamp is a frame that saw nothing. An
-empty `identity` means none. `#` begins a comment.
+Measurements may have further columns look_NAME, numbers that say how what was measured looks: the
+log's descriptors. Rows of one stamp are one frame; a row with nothing but its stamp is a frame that
+saw nothing. An empty `identity` means none. `#` begins a comment.
 """
 
 from math import pi
@@ -46,6 +47,7 @@ LAYOUTS = {
     "truth": [("time_s", *POSE)],
     "landmarks": [("id", "x_m", "y_m")],
 }
+LOOK = "look_"
 REACH = 10.0  # m, declared when nothing was measured that tells
 MOST_YAW_RATE = 6 * pi  # rad/s
 
@@ -69,6 +71,7 @@ def read_csv(paths, view=None, mounting=(0.0, 0.0, 0.0)):
     identity = column.get("identity")
     if identity is not None:
         identity = np.where(np.isnan(identity), -1, identity).astype(np.int64)
+    looks = [name.startswith(LOOK) for name in columns]
     bearing, distance = column.get("bearing_rad"), column.get("range_m")
     if bearing is not None:
         bearing = wrapped(bearing)
@@ -88,6 +91,7 @@ def read_csv(paths, view=None, mounting=(0.0, 0.0, 0.0)):
         point=value[:, :2] if bearing is None else None,
         point_cov=value[:, 2:5] if bearing is None else None,
         identity=identity,
+        descriptor=value[:, looks] if any(looks) else None,
         view=_view(value, bearing, distance) if view is None else view,
         mounting=mounting,
         start_pose=np.zeros(3) if pose is None else pose,
@@ -122,13 +126,21 @@ def _opened(path, wanted=LAYOUTS):
     """Kind of a file by its header; its path, columns, lines and completeness."""
     lines, complete = read_lines(path, ",")
     header = tuple(cell.strip('"').lower() for cell in lines[0][1])
-    kinds = [kind for kind, layouts in LAYOUTS.items() if header in layouts]
+    kinds = [kind for kind, layouts in LAYOUTS.items() if _plain(header, kind) in layouts]
     if not kinds:
         found = ",".join(header)[:80]
         allowed = " or ".join(",".join(row) for kind in wanted for row in LAYOUTS[kind])
         place = f"{path}, line {lines[0][0]}"
         raise ValueError(f"{place}: {found!r} is no known header; allowed: {allowed}")
     return kinds[0], (path, header, lines[1:], complete)
+
+
+def _plain(header, kind):
+    """The header without looks, which only measurements may have, after all else, one name each."""
+    looks = [name.startswith(LOOK) for name in header]
+    size = looks.index(True) if True in looks else len(header)
+    fits = kind == "measurements" and all(looks[size:]) and len(set(header)) == len(header)
+    return header[:size] if fits else header
 
 
 def _sorted_out(paths):
@@ -164,12 +176,12 @@ def _odometry(file, skipped):
 def _measurements(file, skipped):
     """Columns after the stamp, and the rows in order of time; NaN where a frame saw nothing."""
     table, columns = _parse(file, blanks=True), file[1][1:]
-    needed = len(columns) - ("identity" in columns)
+    needed = [name != "identity" for name in columns]
     blank = np.isnan(table.value)
-    partly = ~blank.all(axis=1) & blank[:, :needed].any(axis=1)
+    partly = ~blank.all(axis=1) & blank[:, needed].any(axis=1)
     table = without(table, partly, "a measurement with empty cells")
     if "identity" in columns:
-        number = table.value[:, -1]
+        number = table.value[:, columns.index("identity")]
         wrong = ~np.isnan(number) & (~whole(number) | (number < -1))
         table = without(table, wrong, "identity is not a whole number from -1")
     if "bearing_rad" in columns:
