@@ -123,7 +123,9 @@ def _clocks(log):
         text = "frames fit the odometry's turning best as stamped"
         if abs(found.seconds) > SAME_CLOCK_S:
             text = f"frames fit the odometry's turning best when moved by {found.seconds:.2f} s"
-        text += f" ({found.least:.2f} to {found.most:.2f} s by parts of the log)"
+        text += (
+            f" ({found.least:.2f} to {found.most:.2f} s by parts of the log; convert --time-offset)"
+        )
         hint = ": one clock is late? jaxslam convert LOG OUT.npz --time-offset S moves frames"
         yield _say(abs(found.seconds) > MOST_OFFSET_S, text, hint=hint)
 

@@ -16,6 +16,7 @@ COARSE, FINE = 0.06, 0.01  # s between offsets tried
 FAR = 0.05  # rad: what is farther off than that may be another landmark
 PARTS = 6  # of the log, in each of which the offset is found
 LEAST = 200  # bearings compared in each of them
+ENOUGH = 300_000  # differences of bearings; of more, only every so many frames are looked at
 TURNED = 1.0  # rad turned in each of them
 
 
@@ -73,6 +74,7 @@ def _pairs(log):
     near = np.flatnonzero(np.diff(time) <= APART)
     parts = []
     for some in np.array_split(near, PARTS):
+        some = some[:: 1 + int((size[some] * size[some + 1]).sum()) // ENOUGH]
         apart = [np.subtract.outer(seen[i], seen[i + 1]).ravel() for i in some]
         if size[some].sum() < LEAST:
             return None

@@ -3,26 +3,30 @@
 A log may describe each measurement by numbers of any kind and unit (`Log.descriptor`: colours, an
 edge's ends). Rows of successive frames that can only be of one landmark are linked, and of all
 directions in the descriptors those are kept in which a landmark varies least, compared with all
-rows (linear discriminants: Rao 1948). There each coordinate has the variance 1 over the log, and
-`within` for one landmark; the coordinates are uncorrelated. NumPy.
+such rows (linear discriminants: Rao 1948). Of what lies along them the ranks count, as normal
+scores: each coordinate is standard normal over the log, whatever the columns were. NumPy, SciPy.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import eigh
+from scipy.stats import norm, rankdata
 
 from jaxslam.odometry import increments
 
 ALONE = 0.06  # rad: a row that no other of its frame is nearer to can be linked,
-STEP = 0.03  # rad, to one that is no farther from where the turn takes it
-ROWS = 10  # linked rows a column, at least
+STEP = 0.03  # rad, to one that is no farther from where the turn takes it,
+APART = 1.0  # s later at most
+ROWS = 20  # links a direction, at least: of fewer, noise passes for looks
 MOST = 6  # coordinates
 USEFUL = 0.5  # variance of a linked landmark's coordinate, at most
+BEYOND = 4.0  # standard deviations of a column: what is farther off tells no more
+VARIED = 1e-5  # variance of a direction relative to the largest: less is rounding
 
 
 class Space(NamedTuple):
-    """Where descriptors are compared: `coordinates` [n, J] of all rows, and `within` [J]."""
+    """Where descriptors are compared: `coordinates` [n, J] of all rows, normal scores; and `within`
+    [J], the variance of one landmark's that is reckoned with."""
 
     coordinates: np.ndarray
     within: np.ndarray
@@ -33,25 +37,57 @@ def space(log):
     nothing = Space(np.zeros((len(log.frame), 0)), np.zeros(0))
     if log.descriptor is None or len(log.frame) == 0:
         return nothing
-    x = log.descriptor.astype(float)
-    spread = x.std(0)
-    x = (x - x.mean(0))[:, spread > 1e-6 * (1e-30 + np.abs(x).max(0))]
-    x /= x.std(0)
+    x = _scaled(log.descriptor.astype(float))
     track = _tracks(log)
     inside = track >= 0
-    size = np.bincount(track[inside])
-    if x.shape[1] == 0 or inside.sum() < ROWS * x.shape[1]:
+    freedom = inside.sum() - len(np.unique(track[inside]))
+    if x.shape[1] == 0 or freedom < ROWS:
         return nothing
-    mean = np.stack([np.bincount(track[inside], c) for c in x[inside].T], 1) / size[:, None]
-    off = x[inside] - mean[track[inside]]
-    own = _products(off.T, off) / (inside.sum() - len(size))
-    whole = _products(x.T, x) / len(x)
-    value, vector = eigh(own, whole + 1e-9 * np.eye(len(whole)))
-    kept = np.flatnonzero(value < USEFUL)[:MOST]
-    # Rounded, so that all machines of a run have the same.
-    coordinates = np.round(_products(x, vector[:, kept]), 4)
+    linked, track = x[inside], track[inside]
+    own, whole = _within(linked, track), np.cov(linked.T).reshape(len(x.T), -1)
+    # Columns may repeat each other: only directions in which linked rows vary at all.
+    spread, vector = np.linalg.eigh(whole)
+    kept = spread > VARIED * max(spread[-1], VARIED)
+    if freedom < ROWS * kept.sum():
+        return nothing
+    white = vector[:, kept] / np.sqrt(spread[kept])
+    value, vector = np.linalg.eigh(_products(white.T, _products(own, white)))
+    along = _products(white, vector[:, value < USEFUL][:, :MOST])
+    if along.shape[1] == 0:
+        return nothing
+    along *= np.sign(along[np.abs(along).argmax(0), np.arange(along.shape[1])])
+    coordinates = _normal_scores(_products(x, along))
+    scores = coordinates[inside]
+    value = np.diag(_within(scores, track)) / np.maximum(scores.var(0), VARIED)
+    good = value < USEFUL
     # Links last a few frames, in which light and background change less than over a log.
-    return Space(coordinates, np.round(np.sqrt(np.maximum(value[kept], 1e-4)), 4))
+    return Space(coordinates[:, good], np.round(np.sqrt(np.maximum(value[good], 1e-4)), 4))
+
+
+def _scaled(x):
+    """Columns [n, D] of about unit variance, without those that are constant; few rows far off
+    decide nothing."""
+    x = x[:, x.std(0) > 1e-6 * np.abs(x).max(0)]
+    x = x - np.median(x, 0)
+    usual = 1.4826 * np.median(np.abs(x), 0)
+    x = np.clip(x / np.where(usual > 0, usual, np.maximum(x.std(0), 1e-300)), -BEYOND, BEYOND)
+    return x - x.mean(0)
+
+
+def _within(x, track):
+    """Covariance [D, D] of the rows of one track about their mean."""
+    number, track = np.unique(track, return_inverse=True)
+    size = np.bincount(track)
+    mean = np.stack([np.bincount(track, column) for column in x.T], 1) / size[:, None]
+    off = x - mean[track]
+    return _products(off.T, off) / (len(x) - len(number))
+
+
+def _normal_scores(x):
+    """Every column's ranks [n, J] as quantiles of the standard normal; rounded, so that ranks and
+    scores are the same on all machines of a run."""
+    rank = rankdata(np.round(x, 4), axis=0) if len(x.T) else x
+    return np.round(norm.ppf((rank - 0.5) / len(x)), 4)
 
 
 def _products(a, b):
@@ -71,7 +107,8 @@ def _tracks(log):
         (a, b, c) = bounds[f : f + 3]
         apart = np.abs(_wrap(bearing[b:c] - (bearing[a:b] - turn[f + 1])[:, None]))
         alone = (apart < ALONE).sum(1) == 1, (apart < ALONE).sum(0) == 1
-        pair = (apart < STEP) & alone[0][:, None] & alone[1]
+        near = log.frame_time[f + 1] - log.frame_time[f] <= APART * 1e9
+        pair = (apart < STEP) & alone[0][:, None] & alone[1] & near
         for i, j in zip(*np.nonzero(pair), strict=True):
             if track[a + i] < 0:
                 track[a + i], count = count, count + 1

@@ -218,7 +218,9 @@ def conclude(chance, state, seen, measurements, config):
         state.step + 1,
         seen.bounds,
         seen.ancestry,
-        None if seen.looks is None else looks.learnt(seen.looks, match, birth, measurements),
+        None
+        if seen.looks is None
+        else looks.learnt(seen.looks, match, birth, seen.free, state.step, measurements),
     )
     resampled, ancestors = _resample(moved, wanted, chance.uniform, config)
     overflow, forgotten, outliers = devices.total(

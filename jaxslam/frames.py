@@ -93,7 +93,7 @@ def _looks(log, size, row):
     if len(found.within) < size:
         raise ValueError(
             f"{log.name}: {size} descriptors are asked for, but {len(found.within)} tell landmarks "
-            "apart in this log"
+            "apart in this log (of a part of a log: make its own config, or take 0)"
         )
     coordinates = np.vstack([found.coordinates[:, :size], np.zeros((1, size))])
     return dict(descriptor=coordinates[row], within=np.tile(found.within[:size], (len(row), 1)))

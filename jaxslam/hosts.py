@@ -13,7 +13,10 @@ import sys
 import threading
 import time
 from contextlib import contextmanager, suppress
+from dataclasses import fields
 from typing import NamedTuple
+
+from jaxslam.config import Config
 
 LIMIT = 60.0  # seconds in which all must have come
 GRACE = 3.0  # seconds in which a process may find by itself why another one ended
@@ -182,11 +185,14 @@ def _call(place, run, limit):
 
 
 def differences(told, run):
-    """What differs between two runs, as one line; empty: nothing."""
+    """What differs between two runs, as one line; empty: nothing. A setting that an earlier version
+    did not have counts as its default."""
+    usual = {"config": {f.name: f.default for f in fields(Config) if f.default is not None}}
     lines = []
     for name, value in run.items():
         other = told.get(name, value)
         if isinstance(value, dict):
+            other = usual.get(name, {}) | other
             lines += [
                 f"{key} ({other[key]}, now {now})"
                 for key, now in value.items()

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxslam.association import NEW
 from jaxslam.listing import added, pinned
 
 CHANGED = 0.1  # probability that a landmark looks like any other: something else is behind it
@@ -50,9 +51,14 @@ def gain(looks, measurements):
     return pinned(jnp.logaddexp(jnp.log1p(-CHANGED) + ratio, jnp.log(CHANGED)))
 
 
-def learnt(looks, match, birth, measurements):
+def learnt(looks, match, birth, free, number, measurements):
     """`Looks` after a frame: of the best particle's slots `match` [K] (negative: none), and the
-    `birth` [K] of what is in them."""
+    `birth` [K] of what is in them. What is new has taken the slots `free` [K], in order, in the
+    step of this `number` (`births.create`)."""
+    new, total = (match == NEW) & measurements.valid, len(match)
+    nth = jnp.cumsum(new) - 1
+    match = jnp.where(new, free[jnp.maximum(nth, 0)], match)
+    birth = jnp.where(new, number * total + jnp.arange(total), birth)
     here = (match[:, None] == jnp.arange(looks.mean.shape[1])) & measurements.valid[:, None]
     born = jnp.where(here, birth[:, None], -(2**31)).max(0)
     seen = here.any(0)

@@ -48,7 +48,7 @@ class Observed(NamedTuple):
     over what pose and associations were drawn from; `match` and `birth` [K, N] (`filter.Info`);
     `log_choice` [N], log probability of the draw; `counts` [2, N]: landmarks lost for want of a
     slot, and forgotten; `u` [3, N]: the normals that `motion.sample` made the poses of; and what
-    belongs to the map (None of a block of particles alone)."""
+    belongs to the map (None of a block of particles alone); slots `free` [K] for what was new."""
 
     pose: jax.Array
     landmarks: Landmarks
@@ -61,6 +61,7 @@ class Observed(NamedTuple):
     bounds: gate.Bounds | None = None
     ancestry: Ancestry | None = None
     looks: Looks | None = None
+    free: jax.Array | None = None
 
 
 def observe(state, chance, odometry, measurements, params, config, frozen=False):
@@ -114,7 +115,7 @@ def observe(state, chance, odometry, measurements, params, config, frozen=False)
         bounds = gate.unlimited(state.bounds, found.used | (rows & state.bounds.used))
     else:
         bounds = jax.tree.map(lambda new, old: jnp.where(touched, new, old), found, state.bounds)
-    return seen._replace(bounds=bounds, ancestry=past, looks=looked)
+    return seen._replace(bounds=bounds, ancestry=past, looks=looked, free=free)
 
 
 def _concerned(state, predicted, sensor_pose, odometry, measurements, alike, params, config):

@@ -102,7 +102,7 @@ def refined(result, progress=None):
     if past is None or not np.isfinite(past.pose).all():
         return result
     begin = time.perf_counter()
-    data = framed(log, config, result.params)
+    data = framed(log, dataclasses.replace(config, descriptors=0), result.params)
     try:
         found = refine(
             data, past.pose, past.birth, log.start_pose, log.start_cov, result.params,

@@ -28,6 +28,20 @@ def test_the_offset_that_was_made_is_found(room, seconds):
     assert clocks.offset(hidden) == as_it_is
 
 
+def test_of_very_many_bearings_some_are_enough(room):
+    """A scanner's: 300 a frame, compared each with each."""
+    frame = np.repeat(np.arange(len(room.frame_time)), 300)
+    rng = np.random.default_rng(0)
+    bearing = rng.uniform(-3, 3, len(frame))
+    bearing[np.searchsorted(frame, room.frame) + np.arange(len(room.frame)) % 16] = room.bearing
+    crowd = dataclasses.replace(
+        room, frame=frame, bearing=bearing, range=None, identity=None, truth=None
+    )
+    pairs = clocks._pairs(crowd)
+    assert max(len(part.apart) for part in pairs) <= clocks.ENOUGH + 300**2
+    assert clocks.offset(crowd) is None  # among so many something always fits
+
+
 def test_nothing_is_said_where_nothing_can_be_told(room):
     rng = np.random.default_rng(0)
     noise = dataclasses.replace(room, bearing=rng.uniform(-3, 3, len(room.bearing)))

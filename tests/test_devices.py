@@ -340,3 +340,11 @@ def test_options_go_before_the_launcher():
 def test_a_run_is_the_same_whoever_shares_it():
     one, two = (offline._numbers(Config(devices=d), default_params(), 0) for d in (1, 2))
     assert one == two
+
+
+def test_a_setting_that_an_earlier_version_did_not_have_counts_as_its_default():
+    """A run of that version, put aside, is no run with looks; it is gone on with without."""
+    before = {"config": {"particles": 20}}
+    with_looks, without = ({"config": {"particles": 20, "descriptors": n}} for n in (6, 0))
+    assert hosts.differences(before, with_looks) == "descriptors (0, now 6)"
+    assert hosts.differences(before, without) == ""

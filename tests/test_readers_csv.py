@@ -83,8 +83,15 @@ def test_csv_looks_become_descriptors(tmp_path):
 )
 def test_csv_looks_anywhere_else_are_refused(tmp_path, header):
     row = ",".join("1" for _ in header.split(","))
-    with pytest.raises(ValueError, match=r"measured\.csv, line 1: .* is no known header"):
+    with pytest.raises(ValueError, match=r"line 1: .* is no known header; .*look_NAME columns"):
         read(csv(tmp_path, measured=f"{header}\n{row}\n"))
+
+
+def test_csv_looks_too_large_are_bad_rows(tmp_path):
+    rows = "".join(f"{t / 100},0.1,{t}\n" for t in range(1, 60))
+    log = read(csv(tmp_path, measured=f"time_s,bearing_rad,look_red\n{rows}0.9,0.1,1e300\n"))
+    assert len(log.frame) == 59
+    assert log.skipped == {"bad row in measured.csv (line 61: a number too large)": 1}
 
 
 def test_csv_bearings_alone_see_ten_metres(tmp_path):

@@ -130,6 +130,8 @@ def _opened(path, wanted=LAYOUTS):
     if not kinds:
         found = ",".join(header)[:80]
         allowed = " or ".join(",".join(row) for kind in wanted for row in LAYOUTS[kind])
+        if "measurements" in wanted:
+            allowed += "; of measurements also look_NAME columns at the end"
         place = f"{path}, line {lines[0][0]}"
         raise ValueError(f"{place}: {found!r} is no known header; allowed: {allowed}")
     return kinds[0], (path, header, lines[1:], complete)
@@ -184,6 +186,8 @@ def _measurements(file, skipped):
         number = table.value[:, columns.index("identity")]
         wrong = ~np.isnan(number) & (~whole(number) | (number < -1))
         table = without(table, wrong, "identity is not a whole number from -1")
+    beyond = np.abs(table.value) > np.finfo(np.float32).max
+    table = without(table, beyond.any(axis=1), "a number too large")
     if "bearing_rad" in columns:
         reason = "bearing beyond 2 pi rad (degrees? multiply by pi/180)"
         table = without(table, np.abs(table.value[:, 0]) > 2 * pi, reason, unit=True)
