@@ -67,8 +67,7 @@ def bits(path, settings, changes):
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
     path = tmp_path_factory.mktemp("short") / "log.npz"
-    log = planar("field", 5, landmarks=25, length_m=6.0, rate_hz=2.0, outlier=0.05)
-    save_log(path, coloured(log))
+    save_log(path, planar("field", 5, landmarks=25, length_m=6.0, rate_hz=2.0, outlier=0.05))
     return path
 
 
@@ -82,10 +81,12 @@ def test_devices_make_no_difference(short):
 
 
 @pytest.mark.slow
-def test_rejuvenation_is_the_same_on_devices(short):
+def test_rejuvenation_and_looks_are_the_same_on_devices(tmp_path):
+    log = planar("field", 5, landmarks=25, length_m=4.0, rate_hz=8.0, outlier=0.05)
+    save_log(tmp_path / "log.npz", coloured(log))
     settings = dict(sensor="bearing", particles=504, block=100, landmarks=40, rejuvenate=1.5)
     settings["descriptors"] = 1
-    lines = bits(short, settings, [dict(), dict(devices=2, chunk=7)])
+    lines = bits(tmp_path / "log.npz", settings, [dict(), dict(devices=2, chunk=7)])
     assert len({line[0] for line in lines}) == 1
     assert int(lines[0][2]) >= 3
 

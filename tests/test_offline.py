@@ -28,7 +28,7 @@ LONG = *RUN, "--out", "out", "--checkpoint-every", "0.001"
 
 @pytest.fixture(scope="module")
 def log():
-    return coloured(planar("field", 5, landmarks=25, length_m=6.0, rate_hz=2.0, outlier=0.05))
+    return planar("field", 5, landmarks=25, length_m=6.0, rate_hz=2.0, outlier=0.05)
 
 
 @pytest.fixture
@@ -99,14 +99,15 @@ def test_a_resumed_run_is_bit_for_bit_the_undisturbed_one(log, tmp_path, monkeyp
 
 
 @pytest.mark.slow
-def test_looks_and_particles_drawn_anew_are_gone_on_with_bit_for_bit(log, tmp_path, monkeypatch):
+def test_looks_and_particles_drawn_anew_are_gone_on_with_bit_for_bit(tmp_path, monkeypatch):
+    log = coloured(planar("field", 5, landmarks=25, length_m=4.0, rate_hz=8.0, outlier=0.05))
     settings = dict(sensor="bearing", descriptors=1, rejuvenate=1.5)
     config = config_for(log, particles=30, landmarks=30, **settings)
     whole = runner.run(log, config, None, 3, refine=False)
     assert whole.events is not None
-    monkeypatch.setattr(runner, "CHUNK", 1)
-    broken_off(log, config, tmp_path / "run", 5)
-    broken_off(log, config, tmp_path / "run", 4, resume=True)
+    monkeypatch.setattr(runner, "CHUNK", 7)
+    broken_off(log, config, tmp_path / "run", 3)
+    broken_off(log, config, tmp_path / "run", 3, resume=True)
     same(columns(gone_on(log, config, tmp_path / "run")), columns(whole))
 
 
