@@ -1,5 +1,6 @@
 """Shared by all tests."""
 
+import gc
 import os
 import tempfile
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from jaxslam import cli
 
 LONGEST = "test_the_commands_run", "test_the_python_that_learns_runs"
+MOST_MAPS = 25_000
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
@@ -27,6 +29,17 @@ def pytest_configure(config):
 def pytest_collection_modifyitems(items):
     """The longest come first: begun last, each would keep one worker busy and the others idle."""
     items.sort(key=lambda item: getattr(item, "originalname", None) not in LONGEST)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_programs():
+    """Compiled programs are let go before their memory maps reach the number that Linux allows a
+    process (65,530 unless set otherwise), where compiling ends in a segmentation fault."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture
