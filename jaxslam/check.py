@@ -120,14 +120,12 @@ def _time(log):
 def _clocks(log):
     found = clocks.offset(log)
     if found is not None:
-        text = "frames fit the odometry's turning best as stamped"
+        text = f"best as stamped ({found.least:.2f} to {found.most:.2f} s by parts of the log)"
         if abs(found.seconds) > SAME_CLOCK_S:
-            text = f"frames fit the odometry's turning best when moved by {found.seconds:.2f} s"
-        text += (
-            f" ({found.least:.2f} to {found.most:.2f} s by parts of the log; convert --time-offset)"
-        )
-        hint = ": one clock is late? jaxslam convert LOG OUT.npz --time-offset S moves frames"
-        yield _say(abs(found.seconds) > MOST_OFFSET_S, text, hint=hint)
+            text = text.replace("as stamped", f"when moved by {found.seconds:.2f} s")
+            text += "; jaxslam convert LOG OUT.npz --time-offset S moves them"
+        text = f"frames fit the odometry's turning {text}"
+        yield _say(abs(found.seconds) > MOST_OFFSET_S, text, hint=": one clock is late?")
 
 
 def _gaps(time):

@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxslam.evaluate import wrap
+
 APART = 1.0  # s between two frames that are compared, at most
 MOST = 0.6  # s, an offset
 COARSE, FINE = 0.06, 0.01  # s between offsets tried
@@ -95,8 +97,7 @@ def _best(log, pairs):
         return end - begin
 
     def cost(seconds):
-        off = pairs.apart + turns(seconds)[pairs.pair]
-        off = np.abs((off + np.pi) % (2 * np.pi) - np.pi)
+        off = np.abs(wrap(pairs.apart + turns(seconds)[pairs.pair]))
         nearest = np.minimum.reduceat(off, pairs.first)
         return np.square(np.minimum(nearest / FAR, 1)).sum()
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri
 
+from jaxslam.evaluate import wrap
 from jaxslam.odometry import increments
 
 ALONE = 0.06  # rad: a row that no other of its frame is nearer to can be linked,
@@ -109,7 +110,7 @@ def _tracks(log):
     track, count = np.full(len(bearing), -1), 0
     for f in range(len(log.frame_time) - 1):
         (a, b, c) = bounds[f : f + 3]
-        apart = np.abs(_wrap(bearing[b:c] - (bearing[a:b] - turn[f + 1])[:, None]))
+        apart = np.abs(wrap(bearing[b:c] - (bearing[a:b] - turn[f + 1])[:, None]))
         alone = (apart < ALONE).sum(1) == 1, (apart < ALONE).sum(0) == 1
         near = log.frame_time[f + 1] - log.frame_time[f] <= APART * 1e9
         pair = (apart < STEP) & alone[0][:, None] & alone[1] & near
@@ -118,7 +119,3 @@ def _tracks(log):
                 track[a + i], count = count, count + 1
             track[b + j] = track[a + i]
     return track
-
-
-def _wrap(angle):
-    return (angle + np.pi) % (2 * np.pi) - np.pi
