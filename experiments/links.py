@@ -21,6 +21,7 @@ import numpy as np
 import worlds
 
 from jaxslam import config_for, default_params, load_log, run
+from jaxslam.clocks import moved
 from jaxslam.evaluate import errors, landmark_gate, wrap
 from jaxslam.motion import model
 from jaxslam.runner import framed
@@ -80,11 +81,6 @@ def best_offset(log, params):
         return np.quantile(followed(moved(log, offset), params)[0], 0.9)
 
     return float(min(OFFSETS, key=error))
-
-
-def moved(log, offset):
-    """The log with its images some seconds later."""
-    return dataclasses.replace(log, frame_time=log.frame_time + round(offset * 1e9))
 
 
 def by_place(log, params):
