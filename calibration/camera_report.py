@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.coverage import RINGS, SECTORS
-from jaxslam.plot import FILTER, LANDMARK, PLAN, RECKONING, STYLE, TRUE, write_figure
+from jaxslam.plotting import FILTER, LANDMARK, PLAN, RECKONING, STYLE, TRUE, write_figure
 
 LONGEST = 0.06  # of the image's width: the arrow of the largest residual but outliers
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from calibration.likelihood import maximum_likelihood
 from jaxslam.config import default_params
-from jaxslam.evaluate import truth_at, wrap
-from jaxslam.odometry import increments
+from jaxslam.logs.odometry import increments
+from jaxslam.logs.truth import truth_at, wrap
 
 LEAST = 30  # measurements, and intervals of odometry, below which nothing is estimated
 GAP = 0.25  # s between two true poses, across which a pose may be interpolated

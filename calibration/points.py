@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from scipy.special import gammaln
 
 from calibration.odometry import GAP, LEAST, require
-from jaxslam.evaluate import truth_at, wrap
+from jaxslam.logs.truth import truth_at, wrap
 
 NEAR = np.radians(1.0)  # a line within this of a surveyed one's true bearing may be that one
 GROSS = 100.0  # squared Mahalanobis distance beyond which a point is another line's

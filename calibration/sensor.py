@@ -18,7 +18,7 @@ import numpy as np
 
 from calibration.likelihood import maximum_likelihood
 from calibration.odometry import GAP, LEAST, fit_odometry, require
-from jaxslam.evaluate import truth_at, wrap
+from jaxslam.logs.truth import truth_at, wrap
 
 COARSEST = 0.02  # m; truth read off anything coarser tells nothing of these errors
 OUTLIER = 5.0  # robust standard deviations

@@ -7,18 +7,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.odometry import ODOMETRY
-from calibration.points import (
-    Model,
-    PointErrors,
-    compare,
-    coverage,
-    identified,
-    point_errors,
-)
+from calibration.points import Model, PointErrors, compare, coverage, identified, point_errors
 from calibration.sensor import ErrorModel, fit
 from jaxslam.config import UNITS, Params
-from jaxslam.evaluate import truth_at
-from jaxslam.plot import FILTER, LANDMARK, STYLE, TRUE, ellipses, write_figure
+from jaxslam.logs.truth import truth_at
+from jaxslam.plotting import FILTER, LANDMARK, STYLE, TRUE, ellipses, write_figure
 
 SHOWN = 250  # points drawn at most: more would cover each other
 

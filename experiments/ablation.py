@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam import config_for, default_params, load_log, run
-from jaxslam.evaluate import errors
+from jaxslam.results.metrics import errors
 
 RESULTS = Path(__file__).parent / "results"
 # the motion and the bearing noise of the version before

@@ -22,11 +22,13 @@ import jax
 import numpy as np
 
 from calibration.odometry import fit_odometry
-from jaxslam import default_params, load_log, load_params, sensors
-from jaxslam.evaluate import align_se2, ate, between, map_error, truth_at, with_truth, wrap
-from jaxslam.frames import frames
-from jaxslam.motion import model
-from jaxslam.readers import read_mrclam
+from jaxslam import default_params, load_log, load_params
+from jaxslam.filter.frames import frames
+from jaxslam.logs.readers import read_mrclam
+from jaxslam.logs.truth import truth_at, wrap
+from jaxslam.models import sensors
+from jaxslam.models.motion import model
+from jaxslam.results.metrics import align_se2, ate, between, map_error, with_truth
 
 HERE = Path(__file__).parent
 NOISES = ("sigma_bearing", "growth", "err_tran", "err_rot", "err_drift", "floor_tran")

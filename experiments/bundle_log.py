@@ -8,8 +8,8 @@ import dataclasses
 import sys
 from pathlib import Path
 
-from jaxslam.log import save_log
-from jaxslam.readers.mat import read_mat
+from jaxslam.logs.log import save_log
+from jaxslam.logs.readers.aer1513 import read_mat
 
 TARGET = Path(__file__).parents[1] / "jaxslam" / "data" / "lost-in-the-woods.npz"
 # The course's own convention. What the laser alone says of the motion between two frames fits

@@ -22,7 +22,7 @@ import numpy as np
 from calibration.camera import calibrate_camera, calibrate_corners, held_out
 from calibration.coverage import azimuth_error
 from calibration.simulated import simulate_boards
-from jaxslam.render import double_mirror_camera
+from jaxslam.simulation.room.render import double_mirror_camera
 
 RESULTS = Path(__file__).parent / "results"
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -13,11 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 import vectorised_numpy
 
-from jaxslam import baseline, baseline_ekf, capacity
-from jaxslam import filter as fastslam
 from jaxslam.config import Params, default_params
-from jaxslam.motion import Odometry
-from jaxslam.sensors import Measurements
+from jaxslam.filter import step as fastslam
+from jaxslam.models.motion import Odometry
+from jaxslam.models.sensors import Measurements
+from jaxslam.reference import ekf
+from jaxslam.reference import fastslam as baseline
+from jaxslam.runs import memory
 
 DRIVE = Odometry(0.1, 0.0, 0.01, 0.1, 0.01, 0.2, 0.5, 1 / 12)  # 0.1 m and 0.01 rad in 0.2 s
 KNOWN_TO = 0.05  # m, standard deviation of the given map
@@ -69,7 +71,7 @@ def of_jax(marks, config, params=PARAMS, donated=True):
     factor = np.array([[KNOWN_TO], [0], [KNOWN_TO]]) * np.ones(len(marks))
     init = partial(fastslam.init, config, landmarks_given=(marks.T, factor))
     shapes = jax.eval_shape(init, key)
-    size = capacity.of_arrays(shapes)
+    size = memory.of_arrays(shapes)
     step = jax.jit(
         fastslam.step, static_argnames="config", donate_argnames="state" if donated else ()
     )
@@ -77,7 +79,7 @@ def of_jax(marks, config, params=PARAMS, donated=True):
     if config.devices == 1:  # before the state is there, as a run does: compiling takes memory, too
         given = key, shapes, odometry, frame(np.zeros((k, 2)), hidden), params
         step = step.func.lower(*given, config).compile()
-        capacity.give_back()
+        memory.give_back()
     state = init(key)
 
     def advance(z, ids):
@@ -138,7 +140,7 @@ def of_loop(marks, config, params=PARAMS):
     known = config.association == "known"
 
     def given(i, mark):
-        return baseline_ekf.Landmark(mark, cov, np.zeros(2), 1, params.existence_max, -4 - i)
+        return ekf.Landmark(mark, cov, np.zeros(2), 1, params.existence_max, -4 - i)
 
     maps = [[given(i, mark) for i, mark in enumerate(marks)] for _ in range(n)]
     particles = [baseline.Particle(np.zeros(3), each, -np.log(n)) for each in maps]

@@ -23,11 +23,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import likelihood
 from jaxslam.config import Config, default_params
-from jaxslam.odometry import Odometry
-from jaxslam.sensors import Measurements
-from jaxslam.simulate import planar
+from jaxslam.learning import likelihood
+from jaxslam.logs.odometry import Odometry
+from jaxslam.models.sensors import Measurements
+from jaxslam.simulation.planar import planar
 
 RESULTS = Path(__file__).parent / "results"
 NAMES = ("err_tran", "floor_tran", "gain_tran", "position_scale")

@@ -26,8 +26,9 @@ import jax
 import numpy as np
 from scipy.stats import chi2, truncnorm
 
-from jaxslam import landmarks, sensors
 from jaxslam.config import default_params
+from jaxslam.filter import landmarks
+from jaxslam.models import sensors
 
 RESULTS = Path(__file__).parent / "results"
 STEP, CHECKS = 0.1, (1, 3, 10, 20, 40)  # m; frames at which all is measured

@@ -17,8 +17,8 @@ from collections import Counter
 from hashlib import sha256
 from pathlib import Path
 
-from jaxslam.log import save_log
-from jaxslam.simulate import planar
+from jaxslam.logs.log import save_log
+from jaxslam.simulation.planar import planar
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "experiments" / "results"
@@ -44,7 +44,7 @@ def start(place, out, particles):
 
 def fingerprint(folder):
     """SHA-256 of the results, and the names of files that a finished run does not leave."""
-    from jaxslam.report import FILES
+    from jaxslam.results.run_folder import FILES
 
     digest = sha256()
     for name in COMPARED:

@@ -27,9 +27,11 @@ import jax
 import numpy as np
 
 from calibration.odometry import fit_odometry
-from jaxslam import config_for, default_params, learn, load_log, run, save_params, uncertainty
-from jaxslam.evaluate import errors
-from jaxslam.parts import cut, spaced, windows
+from jaxslam import config_for, default_params, load_log, run, save_params
+from jaxslam.learning import fit as learn
+from jaxslam.learning import uncertainty
+from jaxslam.logs.slicing import cut, spaced, windows
+from jaxslam.results.metrics import errors
 
 RESULTS = Path(__file__).parent / "results"
 PARAMS = Path(__file__).parent / "params"

@@ -17,9 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-from jaxslam import baseline, compare, learn, likelihood, scale, simulate
 from jaxslam.config import Config, Params, default_params
-from jaxslam.frames import frames
+from jaxslam.filter.frames import frames
+from jaxslam.learning import fit as learn
+from jaxslam.learning import likelihood, transforms
+from jaxslam.reference import compare, fastslam
+from jaxslam.simulation import planar
 
 RESULT = Path(__file__).parent / "results" / "learn_time.md"
 TRUTH = dict(err_tran=0.05, err_drift=0.05, sigma_range=0.1, sigma_bearing=0.03, gain_rot=1.0)
@@ -50,7 +53,7 @@ class Point(NamedTuple):
 
 
 def world(seed):
-    return simulate.planar(
+    return planar.planar(
         "field", seed, landmarks=20, length_m=FRAMES / 10 + 0.05, rate_hz=5.0, odometry_hz=10.0,
         max_per_frame=8, closed_loop=False, outlier=0.0, **TRUTH,
     )  # fmt: skip
@@ -61,7 +64,7 @@ def likelihood_of(log, params):
     data = likelihood.data_of(log, CONFIG, params)
 
     def value(free, key):
-        given = scale.put(params, NAMES, np.asarray(free, np.float32))
+        given = transforms.put(params, NAMES, np.asarray(free, np.float32))
         return float(likelihood.value(Params(*map(jnp.float32, given)), data, key, CONFIG))
 
     return value
@@ -122,7 +125,7 @@ def baseline_seconds(log, params):
     draws = rng.normal(size=(3, count)), rng.normal(size=(PART, 3, count)), rng.uniform(size=PART)
     begin = time.process_time()
     start = log.start_pose, log.start_cov
-    baseline.run(data.odometry, data.measurements, params, CONFIG, *start, *draws)
+    fastslam.run(data.odometry, data.measurements, params, CONFIG, *start, *draws)
     return (time.process_time() - begin) * FRAMES / PART
 
 
@@ -144,8 +147,8 @@ def main():
     began = time.perf_counter(), time.process_time()
     log, other = world(5), world(6)
     truth = default_params(CONFIG.sensor, log)
-    true = scale.taken(truth, NAMES)
-    start = Params(*map(float, scale.put(truth, NAMES, true + OFF)))
+    true = transforms.taken(truth, NAMES)
+    start = Params(*map(float, transforms.put(truth, NAMES, true + OFF)))
     value, held_out = likelihood_of(log, truth), likelihood_of(other, truth)
     of_value = first_call(lambda: value(true, jax.random.key(1)))
     of_score = first_call(lambda: learn.fit([log], CONFIG, start, NAMES, seeds=1, steps=1))

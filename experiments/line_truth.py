@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from jaxslam.evaluate import truth_at, wrap
-from jaxslam.room import visible_edges
+from jaxslam.logs.truth import truth_at, wrap
+from jaxslam.simulation.room.geometry import visible_edges
 
 PAIR = np.radians(1.0)  # a line and an edge farther apart are not one another
 SURE = np.radians(0.2)  # a line is called by an edge's name if so near to where the edge is seen

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from line_truth import named
 
-from jaxslam.drive import stop_and_go
-from jaxslam.evaluate import wrap
-from jaxslam.furnish import furnish
-from jaxslam.render import PRESETS, double_mirror_camera, frames
+from jaxslam.logs.truth import wrap
+from jaxslam.simulation.room.furniture import furnish
+from jaxslam.simulation.room.render import PRESETS, double_mirror_camera, frames
+from jaxslam.simulation.room.trajectory import stop_and_go
 from jaxslam.vision.lines import extract_lines
 from jaxslam.vision.matching import MatchSettings, match
 

@@ -21,10 +21,11 @@ import numpy as np
 import worlds
 
 from jaxslam import config_for, default_params, load_log, run
-from jaxslam.clocks import moved
-from jaxslam.evaluate import errors, landmark_gate, wrap
-from jaxslam.motion import model
-from jaxslam.runner import framed
+from jaxslam.logs.clock_offset import moved
+from jaxslam.logs.truth import wrap
+from jaxslam.models.motion import model
+from jaxslam.results.metrics import errors, landmark_gate
+from jaxslam.runs.run import framed
 
 RESULTS = Path(__file__).parent / "results"
 WITHIN = 1.0  # s between two looks at a landmark

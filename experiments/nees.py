@@ -31,14 +31,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2
 
-from jaxslam import filter as fastslam
-from jaxslam import landmarks as maps
 from jaxslam.config import Config, Params, default_params
-from jaxslam.evaluate import wrap
-from jaxslam.frames import frames
-from jaxslam.refine import refine
-from jaxslam.simulate import planar
-from jaxslam.smoothing import Tree, lineage
+from jaxslam.filter import landmarks as maps
+from jaxslam.filter import step as fastslam
+from jaxslam.filter.frames import frames
+from jaxslam.logs.truth import wrap
+from jaxslam.simulation.planar import planar
+from jaxslam.smoother.genealogy import Tree, lineage
+from jaxslam.smoother.refine import refine
 
 RESULTS = Path(__file__).parent / "results"
 SLOTS, MOST = 48, 8  # landmarks in the map, measurements in a frame

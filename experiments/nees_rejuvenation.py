@@ -19,8 +19,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from jaxslam import config_for, default_params, load_log, run
-from jaxslam.evaluate import truth_at, wrap
-from jaxslam.simulate import planar
+from jaxslam.logs.truth import truth_at, wrap
+from jaxslam.simulation.planar import planar
 
 RESULTS = Path(__file__).parent / "results"
 CASES = {

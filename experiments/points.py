@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam import config_for, default_params, run
-from jaxslam.simulate import planar
-from jaxslam.vision.points import PointSettings, triangulate_log
+from jaxslam.simulation.planar import planar
+from jaxslam.vision.log_triangulation import PointSettings, triangulate_log
 
 RESULTS = Path(__file__).parent / "results"
 ROBOT = dict(err_tran=0.0075, err_rot=0.02, err_drift=0.01, floor_tran=0.0005, floor_rot=0.0005)

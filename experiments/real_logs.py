@@ -23,7 +23,7 @@ import numpy as np
 import worlds
 
 from jaxslam import Log, config_for, load_log, run
-from jaxslam.evaluate import errors
+from jaxslam.results.metrics import errors
 
 RESULTS = Path(__file__).parent / "results"
 # landmarks by batch with known identities, as measured before this project began [m]

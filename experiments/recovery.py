@@ -26,9 +26,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxslam import learn, likelihood, scale, simulate, uncertainty
-from jaxslam.atomic import replacing
 from jaxslam.config import Config, Params, default_params
+from jaxslam.files import replacing
+from jaxslam.learning import fit, likelihood, transforms, uncertainty
+from jaxslam.simulation import planar
 
 RESULTS = Path(__file__).parent / "results"
 NOISE = {
@@ -50,7 +51,7 @@ def world(case, number):
     """A log, and the true values of what is learnt from it."""
     names, rng = CASES[case][2], np.random.default_rng([2026, number])
     truth = {n: NOISE[n][0] * float(np.exp(NOISE[n][1] * rng.standard_normal())) for n in NOISE}
-    log = simulate.planar(
+    log = planar.planar(
         "field", 1000 + number, landmarks=20, length_m=30, rate_hz=2.5, odometry_hz=12.5,
         max_per_frame=8, closed_loop=False, clearance=0.5,
         outlier=0.01 if case == "hidden" else 0.0,
@@ -74,12 +75,14 @@ def problem(case, count):
     params = default_params(sensor, logs[0])._replace(density_new=1e-3, outlier=outlier)
     with jax.enable_x64(True):
         true = np.array(
-            [[float(scale.to_free(n, v)) for n, v in zip(names, t, strict=True)]
+            [[float(transforms.to_free(n, v)) for n, v in zip(names, t, strict=True)]
              for _, t, _ in worlds]
         )  # fmt: skip
-    off = np.where([name.startswith("gain") for name in names], 0.2 / scale.SCALE["gain_rot"], 1.0)
+    off = np.where(
+        [name.startswith("gain") for name in names], 0.2 / transforms.SCALE["gain_rot"], 1.0
+    )
     return (
-        learn.stacked(logs, config, params),
+        fit.stacked(logs, config, params),
         config,
         params,
         names,
@@ -100,7 +103,7 @@ class Scores:
         """`Score` with leading axes (logs, seeds), at `free` [L, P]."""
         which = np.repeat(np.arange(self.count), seeds)
         keys = jax.random.split(jax.random.key(seed), len(which))
-        found = learn.scores(
+        found = fit.scores(
             jnp.asarray(free[which], jnp.float32), *self.given, which, keys, *self.model,
             likelihood.DISCOUNT,
         )  # fmt: skip
@@ -111,7 +114,7 @@ class Scores:
 
 def climbed(scores, start, saved):
     """Free values [L, P] after Adam, the last iterates' mean. `saved`: a file to go on from."""
-    adam = optax.adam(optax.cosine_decay_schedule(RATE, STEPS, learn.LAST_RATE), *learn.MOMENTS)
+    adam = optax.adam(optax.cosine_decay_schedule(RATE, STEPS, fit.LAST_RATE), *fit.MOMENTS)
     free, past, state = start, [], adam.init(jnp.asarray(start, jnp.float32))
     leaves, shape = jax.tree.flatten(state)
     if saved.exists():
@@ -131,7 +134,7 @@ def climbed(scores, start, saved):
             np.savez(file, past=np.array(past), free=free, **leaves)
         spent = time.perf_counter() - begin
         print(f"step {step + 1}/{STEPS}, {spent:.0f} s", file=sys.stderr, flush=True)
-    last = round(learn.TAIL * STEPS)
+    last = round(fit.TAIL * STEPS)
     return np.mean([*past[-last + 1 :], free], 0)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import worlds
 
 from jaxslam import config_for, default_params, load_log, run
-from jaxslam.evaluate import errors
+from jaxslam.results.metrics import errors
 
 RESULTS = Path(__file__).parent / "results"
 NOISES = ("sigma_bearing", "growth", "correlation", "outlier", "err_tran", "err_rot", "err_drift")

@@ -25,18 +25,19 @@ from line_truth import CONTRAST, TALL, identified, named
 from calibration import sensor_report
 from calibration.points import coverage, point_errors, with_model
 from jaxslam import config_for, default_params, run
-from jaxslam.evaluate import association_accuracy, ate, pair_by_distance, truth_at
-from jaxslam.furnish import furnish
-from jaxslam.render import double_mirror_camera, nominal, render_room
-from jaxslam.room import visible_edges
+from jaxslam.logs.truth import truth_at
+from jaxslam.results.metrics import association_accuracy, ate, pair_by_distance
+from jaxslam.simulation.room.furniture import furnish
+from jaxslam.simulation.room.geometry import visible_edges
+from jaxslam.simulation.room.render import double_mirror_camera, nominal, render_room
 from jaxslam.vision.camera_files import load_camera
 from jaxslam.vision.extract import extract
 from jaxslam.vision.images import read_image
 from jaxslam.vision.lines import LineSettings, extract_lines
+from jaxslam.vision.log_triangulation import PointSettings
 from jaxslam.vision.matching import MatchSettings
 from jaxslam.vision.overlay import draw_lines, draw_on_image
 from jaxslam.vision.panorama import panorama, unwrap
-from jaxslam.vision.points import PointSettings
 
 RESULTS = Path(__file__).parent / "results"
 FIGURE = Path(__file__).parents[1] / "docs" / "room.png"
@@ -229,7 +230,7 @@ def draw(result, seed, path):
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
-    from jaxslam.plot import STYLE, write_figure
+    from jaxslam.plotting import STYLE, write_figure
 
     log = result.log
     true, refined = truth_at(log.truth, result.time), result.refined.pose

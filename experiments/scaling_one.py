@@ -26,10 +26,10 @@ import contenders
 import jax
 import numpy as np
 
-from jaxslam import capacity
-from jaxslam import filter as fastslam
-from jaxslam.capacity import available
 from jaxslam.config import Config
+from jaxslam.filter import step as fastslam
+from jaxslam.runs import memory
+from jaxslam.runs.memory import available
 
 C_FOLDER = Path(__file__).resolve().parents[2] / "shared" / "bench"
 C_FLAGS = "-Ofast -march=native -mprefer-vector-width=512 -fopenmp-simd"
@@ -60,7 +60,7 @@ def config_of(given):
 def needed(config, who="jaxslam"):
     """Bytes of `State`, and at most needed for a run."""
     state = jax.eval_shape(lambda: fastslam.init(config, jax.random.key(0)))
-    size = capacity.of_arrays(state)
+    size = memory.of_arrays(state)
     if who != "jaxslam":  # a second map while resampling; NumPy all at once: tables
         n, m, k = config.particles, config.landmarks, config.measurements
         tables = 6 * 4 * n * m * k if who == "numpy" and config.association != "known" else 0

@@ -28,7 +28,7 @@ import spacing_world as world
 from scipy.optimize import linear_sum_assignment
 
 import jaxslam
-from jaxslam import evaluate
+from jaxslam.results import metrics
 
 HERE = Path(__file__).parent
 RESULTS, FIGURE = HERE / "results", HERE.parent / "docs" / "spacing.png"
@@ -84,18 +84,18 @@ def measures(log, pose, row, match, mean, identity):
     who = np.where(row >= 0, truth.identity[row.clip(0)], -1).ravel()
     taken, counted = match.ravel(), match.ravel() >= -2
     wrong = (taken >= 0) & ((who[taken.clip(0)] != who) | (who < 0))
-    true = evaluate.truth_at(truth, log.frame_time)
-    motion = evaluate.align_se2(pose[:, :2], true[:, :2])
-    found = evaluate.map_error(mean, identity, truth, motion)
+    true = metrics.truth_at(truth, log.frame_time)
+    motion = metrics.align_se2(pose[:, :2], true[:, :2])
+    found = metrics.map_error(mean, identity, truth, motion)
     given = SimpleNamespace(log=log, row=row, match=match)
     label = np.where(taken == -1, np.arange(taken.size), taken)
     told = dict(
-        right=evaluate.association_accuracy(given, log),
+        right=metrics.association_accuracy(given, log),
         one_to_one=shared(who[counted], label[counted]),
         wrong=float(wrong[counted].mean()),
         aside=float(((taken == -2) & (who >= 0))[counted].mean()),
-        path_m=evaluate.ate(pose, true)[0],
-        ospa_m=ospa(evaluate.apply_se2(motion, mean), truth.landmarks),
+        path_m=metrics.ate(pose, true)[0],
+        ospa_m=ospa(metrics.apply_se2(motion, mean), truth.landmarks),
         landmark_m=found.get("rmse_m"),
     )
     told["begun"] = 1 - told["right"] - told["wrong"] - told["aside"]

@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from jaxslam.frames import frames
-from jaxslam.odometry import moments
+from jaxslam.filter.frames import frames
+from jaxslam.logs.odometry import moments
 
 GATE = 0.95  # of chi-squared: what is compatible
 NO_OTHER = 0.9999  # so far from all points that are still free must a new one's bearing be

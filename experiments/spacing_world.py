@@ -12,7 +12,7 @@ from math import radians
 
 import numpy as np
 
-from jaxslam.simulate import ROOM, planar
+from jaxslam.simulation.planar import ROOM, planar
 
 GROUP = 3  # lines
 GROUPS = (3, 1)  # on a long wall, on a short one

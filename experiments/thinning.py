@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import filter as fastslam
 from jaxslam.config import Config, Params, default_params
-from jaxslam.frames import frames
-from jaxslam.simulate import planar
+from jaxslam.filter import step as fastslam
+from jaxslam.filter.frames import frames
+from jaxslam.simulation.planar import planar
 
 RESULTS = Path(__file__).parent / "results"
 RATE = 67  # Hz, of the odometry as it comes

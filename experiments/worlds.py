@@ -12,7 +12,7 @@ from math import radians, sqrt
 
 import numpy as np
 
-from jaxslam.simulate import planar
+from jaxslam.simulation.planar import planar
 
 STEP, CORNER = 0.1, 0.125  # m and rad per frame
 NOISE = {

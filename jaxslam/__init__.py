@@ -14,42 +14,46 @@ _WHERE = {
     "Config": "config",
     "Params": "config",
     "default_params": "config",
-    "load_params": "paramfile",
-    "save_params": "paramfile",
-    "Log": "log",
-    "Truth": "log",
-    "FloorPlan": "log",
-    "load_log": "log",
-    "cut": "parts",
-    "windows": "parts",
-    "spaced": "parts",
-    "save_log": "log",
-    "read": "readers",
-    "config_for": "runner",
-    "run": "runner",
-    "Result": "runner",
-    "init": "filter",
-    "step": "filter",
-    "State": "filter",
-    "Info": "filter",
-    "errors": "evaluate",
-    "planar": "simulate",
+    "load_params": "parameter_file",
+    "save_params": "parameter_file",
+    "Log": "logs.log",
+    "Truth": "logs.log",
+    "FloorPlan": "logs.log",
+    "load_log": "logs.log",
+    "cut": "logs.slicing",
+    "windows": "logs.slicing",
+    "spaced": "logs.slicing",
+    "save_log": "logs.log",
+    "read": "logs.readers",
+    "config_for": "runs.run",
+    "run": "runs.run",
+    "Result": "results.result",
+    "init": "filter.step",
+    "step": "filter.step",
+    "State": "filter.step",
+    "Info": "filter.step",
+    "errors": "results.metrics",
+    "planar": "simulation.planar",
     "Camera": "vision.camera",
     "load_camera": "vision.camera_files",
     "save_camera": "vision.camera_files",
     "extract_lines": "vision.lines",
     "extract": "vision.extract",
     "triangulate_log": "vision.points",
-    "render_room": "render",
+    "render_room": "simulation.room.render",
 }
-_MODULES = ("learn", "likelihood", "uncertainty")
+_MODULES = {
+    "learn": "learning.fit",
+    "likelihood": "learning.likelihood",
+    "uncertainty": "learning.uncertainty",
+}
 __version__ = "0.1.0"
 __all__ = sorted([*_WHERE, *_MODULES])
 
 
 def __getattr__(name):
     if name in _MODULES:
-        return importlib.import_module(f"jaxslam.{name}")
+        return importlib.import_module(f"jaxslam.{_MODULES[name]}")
     if name not in _WHERE:
         raise AttributeError(f"module 'jaxslam' has no attribute {name!r}")
     return getattr(importlib.import_module(f"jaxslam.{_WHERE[name]}"), name)

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from jaxslam import cli
+from jaxslam.cli import main as cli
 
 LONGEST = "test_the_commands_run", "test_the_python_that_learns_runs"
 MOST_MAPS = 25_000

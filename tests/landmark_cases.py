@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import landmarks
 from jaxslam.config import default_params
+from jaxslam.filter import landmarks
 
 PARAMS = default_params()._replace(
     growth=0.02, position_scale=1.3, mount_x=0.2, mount_yaw=0.1, caution=0.0

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxslam.readers import read
+from jaxslam.logs.readers import read
 
 
 def refused(paths, message, robot=None):

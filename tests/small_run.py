@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 
 from jaxslam.config import Config, Params
-from jaxslam.log import FloorPlan, Log, Truth
-from jaxslam.refine import Refined
-from jaxslam.result import MapEstimate, Result
-from jaxslam.smoothing import Ancestral, Lineage
+from jaxslam.logs.log import FloorPlan, Log, Truth
+from jaxslam.results.result import MapEstimate, Result
+from jaxslam.smoother.genealogy import Ancestral, Lineage
+from jaxslam.smoother.refine import Refined
 
 LANDMARKS = np.array([[3.0, 0.0], [0.0, 3.0], [-3.0, 0.0], [0.0, -3.0]])
 START = 1_700_000_000_123_456_789  # ns

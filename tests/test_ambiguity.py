@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxslam.ambiguity import entropy
+from jaxslam.results.ambiguity import entropy
 
 
 def test_entropy_counts_particles_as_often_as_they_go_on():

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import ancestry, gate
-from jaxslam import filter as fastslam
 from jaxslam.config import Config, Params, default_params
-from jaxslam.frames import frames
-from jaxslam.landmarks import Landmarks
-from jaxslam.listing import listed
-from jaxslam.simulate import planar
+from jaxslam.filter import candidate_slots, lazy_resampling
+from jaxslam.filter import step as fastslam
+from jaxslam.filter.frames import frames
+from jaxslam.filter.landmarks import Landmarks
+from jaxslam.filter.xla import listed
+from jaxslam.simulation.planar import planar
 
 PARTICLES, SLOTS = 64, 48
 
@@ -44,12 +44,12 @@ def test_chains_give_what_copying_at_once_gives():
         count=jnp.asarray(rng.integers(0, 9, (12, PARTICLES)), jnp.int32),
         birth=jnp.asarray(rng.integers(0, 9, (12, PARTICLES)), jnp.int32),
     )
-    past, plain = ancestry.new(config), jax.tree.map(np.array, world)
-    update = jax.jit(partial(ancestry.update, config=config))
-    resampled = jax.jit(ancestry.resampled)
+    past, plain = lazy_resampling.new(config), jax.tree.map(np.array, world)
+    update = jax.jit(partial(lazy_resampling.update, config=config))
+    resampled = jax.jit(lazy_resampling.resampled)
     stale = 0
     for _ in range(60):
-        looked = jnp.asarray(rng.uniform(size=12) < 0.2) | ancestry.last_of(past)
+        looked = jnp.asarray(rng.uniform(size=12) < 0.2) | lazy_resampling.last_of(past)
         world, past = update(world, past, looked)
         for slot in np.flatnonzero(looked):
             change = rng.normal(size=PARTICLES).astype("f")
@@ -60,7 +60,7 @@ def test_chains_give_what_copying_at_once_gives():
         past = resampled(past, ancestors, wanted)
         if wanted:
             plain = jax.tree.map(lambda leaf: leaf[..., ancestors], plain)  # noqa: B023
-        stale += int((past.chain != ancestry.CURRENT).sum())
+        stale += int((past.chain != lazy_resampling.CURRENT).sum())
     assert stale > 100
     world, _ = update(world, past, True)
     jax.tree.map(np.testing.assert_array_equal, world, plain)
@@ -130,7 +130,7 @@ def test_slots_passed_over_change_nothing(monkeypatch, sensor, association):
             log, point=point, point_cov=np.tile([0.01, 0.0, 0.01], (len(point), 1))
         )
     config = Config(sensor=sensor, association=association, particles=PARTICLES, landmarks=100)
-    concerned, seen = gate.concerned, []
+    concerned, seen = candidate_slots.concerned, []
 
     def watched(config, bounds, *rest):
         rows = concerned(config, bounds, *rest)
@@ -140,10 +140,12 @@ def test_slots_passed_over_change_nothing(monkeypatch, sensor, association):
         return rows
 
     jax.clear_caches()
-    monkeypatch.setattr(gate, "concerned", watched)
+    monkeypatch.setattr(candidate_slots, "concerned", watched)
     state, info = driven(config, log)
     jax.effects_barrier()
-    monkeypatch.setattr(gate, "concerned", lambda config, bounds, *_: jnp.ones_like(bounds.used))
+    monkeypatch.setattr(
+        candidate_slots, "concerned", lambda config, bounds, *_: jnp.ones_like(bounds.used)
+    )
     jax.clear_caches()
     other, same = driven(config, log)
     # A frame of fewer slots is another program, which may round differently.
@@ -163,7 +165,7 @@ def test_bounds_hold_for_every_particle(log):
     """Of every slot with a landmark in some particle, at the end of a run."""
     config = Config(particles=PARTICLES, landmarks=SLOTS)
     state, _ = driven(config, log)
-    bounds, exact = state.bounds, gate.of_rows(state.landmarks)
+    bounds, exact = state.bounds, candidate_slots.of_rows(state.landmarks)
     assert (bounds.used | ~exact.used).all() and exact.used.sum() > 5
     assert (bounds.low <= exact.low).all() and (bounds.high >= exact.high).all()
     assert (bounds.spread >= exact.spread * (1 - 1e-6)).all()  # worked out by another program

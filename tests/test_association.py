@@ -3,10 +3,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.association import CLUTTER, NEW, PADDING, _possible, associate
 from jaxslam.config import Config, default_params
-from jaxslam.landmarks import Scorer, score
-from jaxslam.sensors import Measurements
+from jaxslam.filter.association import CLUTTER, NEW, PADDING, _possible, associate
+from jaxslam.filter.landmarks import Scorer, score
+from jaxslam.models.sensors import Measurements
 
 K, M, N = 5, 7, 300
 

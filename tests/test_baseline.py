@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxslam import baseline, compare, simulate
-from jaxslam import baseline_ekf as ekf
 from jaxslam.config import Config, default_params
+from jaxslam.reference import compare, ekf, fastslam
+from jaxslam.simulation import planar
 
 SENSORS = ("position", "range_bearing", "bearing")
 STILL = {"dx": 0, "dy": 0, "dtheta": 0, "distance": 0, "turn": 0, "duration": 0}
@@ -35,7 +35,7 @@ def make_config(**changes):
 
 
 def make_model(config=None, **changes):
-    return baseline.make_model(make_params(**changes), make_config(**(config or {})))
+    return fastslam.make_model(make_params(**changes), make_config(**(config or {})))
 
 
 def make_odometry(steps=1, **fields):
@@ -65,7 +65,7 @@ def go(frames, config=None, params=None, particles=1, pose=(1.0, 2.0, 0.5), seed
     """Run from a start known exactly; `fields` are the odometry of every step."""
     draw = np.random.default_rng(seed)
     steps = len(frames.valid)
-    return baseline.run(
+    return fastslam.run(
         make_odometry(steps, **fields),
         frames,
         params or make_params(),
@@ -103,7 +103,7 @@ def test_standing_robot_is_a_kalman_filter():
     s = ekf.sensor_pose(np.array([1.0, 2.0, 0.5]), make_model())
     np.testing.assert_allclose(s[2], 0.8)
     turn = ekf.rotation(s[2])
-    ((slot, mean, cov),) = baseline.map_of(result.particles[0], "position")
+    ((slot, mean, cov),) = fastslam.map_of(result.particles[0], "position")
     assert slot == 0
     np.testing.assert_allclose(mean, s[:2] + turn @ z.mean(axis=0), atol=1e-12)
     np.testing.assert_allclose(cov, turn @ (4 * r / 6) @ turn.T, atol=1e-14)
@@ -120,7 +120,7 @@ def test_shared_landmark_is_weighed_as_it_is_after_the_first_match():
     r = np.array([[0.04, 0.01], [0.01, 0.02]])
     first = log_normal(np.array([0.1, 0.0]), 2 * r)
     second = log_normal(np.array([1.9, 1.1]) - [2.05, 1.0], 1.5 * r)
-    assert result.match[1, 0].tolist() == [0, 0, baseline.PADDING]
+    assert result.match[1, 0].tolist() == [0, 0, fastslam.PADDING]
     assert result.log_evidence[1] == pytest.approx(first + second)
     assert result.particles[0].landmarks[0].count == 3
 
@@ -170,7 +170,7 @@ def test_frame_number_counts_from_first_step():
     draws = np.zeros((3, 1)), np.zeros((1, 3, 1)), np.zeros(1)
     frames, start = make_frames([[(2.0, -1.0), (2.0, 1.0)]]), (np.zeros(3), np.zeros((3, 3)))
     seen = []
-    result = baseline.run(
+    result = fastslam.run(
         make_odometry(),
         frames,
         make_params(),
@@ -191,8 +191,8 @@ def test_existence_by_hand():
     xy = [(2.0, 0.0), (0.0, 4.0), (-4.0, 0.0), (11.0, 0.0), (4.0, 0.0)]
     odds = [1.0, -miss + 0.1, 1.0, 1.0, -miss - 0.1]
     marks = [make_landmark(p, log_odds=o) for p, o in zip(xy, odds, strict=True)]
-    particle = baseline.Particle(np.zeros(3), [*marks, None], 0.0)
-    freed = baseline.forget(particle, range(5), [0], np.zeros(3), model)
+    particle = fastslam.Particle(np.zeros(3), [*marks, None], 0.0)
+    freed = fastslam.forget(particle, range(5), [0], np.zeros(3), model)
     assert freed == 1
     assert particle.landmarks[4:] == [None, None]
     assert [mark.log_odds for mark in marks[:4]] == pytest.approx([1.2, 0.1, 1.0, 1.0])
@@ -236,8 +236,8 @@ def test_no_weight_left_is_flagged_and_made_uniform():
 
 def test_map_of_skips_empty_slots():
     landmark = make_landmark([2.0, 0.5], anchor=(1.0, -1.0))
-    particle = baseline.Particle(np.zeros(3), [None, landmark, None], 0.0)
-    ((slot, mean, _),) = baseline.map_of(particle, "bearing")
+    particle = fastslam.Particle(np.zeros(3), [None, landmark, None], 0.0)
+    ((slot, mean, _),) = fastslam.map_of(particle, "bearing")
     assert slot == 1
     np.testing.assert_allclose(mean, [1 + 2 * math.cos(2), -1 + 2 * math.sin(2)])
 
@@ -255,7 +255,7 @@ def test_small_world(sensor, association):
     pose, frames, truth = np.zeros(3), [], []
     drive = {"dx": 0.1, "dtheta": 0.03, "distance": 0.1, "turn": 0.03, "duration": 0.1}
     for _ in range(steps):
-        pose = baseline.move(pose, SimpleNamespace(**STILL | drive), np.zeros(3), model)
+        pose = fastslam.move(pose, SimpleNamespace(**STILL | drive), np.zeros(3), model)
         s = ekf.sensor_pose(pose, model)
         d = (marks - s[:2]) @ ekf.rotation(s[2])
         r, b = np.hypot(*d.T), np.arctan2(d[:, 1], d[:, 0])
@@ -283,7 +283,7 @@ def test_small_world(sensor, association):
     error = np.linalg.norm(result.pose_mean[:, :2] - np.array(truth)[:, :2], axis=1)
     assert error.max() < 0.4
     best = result.particles[int(np.argmax(result.log_weight[-1]))]
-    points = np.array([mean for _, mean, _ in baseline.map_of(best, sensor)])
+    points = np.array([mean for _, mean, _ in fastslam.map_of(best, sensor)])
     nearest = np.linalg.norm(points[:, None] - marks, axis=2).min(axis=0)
     if sensor == "bearing":  # the one straight ahead may have no depth yet
         assert np.sort(nearest)[:3].max() < 1.0
@@ -296,7 +296,7 @@ def test_small_world(sensor, association):
 
 @pytest.mark.parametrize("sensor", ["range_bearing", "bearing"])
 def test_correlated_and_further_errors_as_in_the_filter(sensor):
-    log = simulate.planar(length_m=4.0, landmarks=12, seed=3)
+    log = planar.planar(length_m=4.0, landmarks=12, seed=3)
     config = Config(sensor=sensor, particles=4, measurements=6, landmarks=10)
     plain = default_params(sensor, log)._replace(correlation=0.0, caution=0.0)
 

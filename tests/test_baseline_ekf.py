@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxslam import baseline_ekf as ekf
+from jaxslam.reference import ekf
 
 SENSORS = ("position", "range_bearing", "bearing")
 NOISE = {"sigma_range": 0.1, "sigma_bearing": 0.05, "growth": 0.03, "position_scale": 1.5}

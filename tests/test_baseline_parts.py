@@ -9,8 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxslam import baseline
-from jaxslam import baseline_ekf as ekf
+from jaxslam.reference import ekf, fastslam
 
 STILL = {"dx": 0, "dy": 0, "dtheta": 0, "distance": 0, "turn": 0, "duration": 0}
 STILL |= {"lever": 0.5, "lever_var": 1 / 12}
@@ -23,7 +22,7 @@ SENSING |= {"sigma_bearing": 0.05, "caution": 0.0}
 def make_model(config=None, **changes):
     rules = {"sensor": "range_bearing", "clutter": True, "association": "known"} | (config or {})
     params = SimpleNamespace(**MOTION | SENSING | changes)
-    return baseline.make_model(params, SimpleNamespace(**rules))
+    return fastslam.make_model(params, SimpleNamespace(**rules))
 
 
 def make_landmark(mean):
@@ -33,7 +32,7 @@ def make_landmark(mean):
 
 def test_imports_numpy_and_itself_only():
     allowed = {"copy", "math", "dataclasses", "types", "typing", "numpy", "jaxslam.baseline_ekf"}
-    for module in (baseline, ekf):
+    for module in (fastslam, ekf):
         for node in ast.walk(ast.parse(Path(module.__file__).read_text())):
             if isinstance(node, ast.Import):
                 assert {name.name for name in node.names} <= allowed
@@ -48,7 +47,7 @@ def test_imports_numpy_and_itself_only():
 @pytest.mark.parametrize("forward", [1.5, -1.5])
 def test_move_without_noise_translates_then_rotates(forward):
     o = SimpleNamespace(**STILL | {"dx": forward, "dtheta": 4.0, "distance": 1.5, "turn": 4.0})
-    pose = baseline.move(np.array([1.0, 2.0, 0.5]), o, np.ones(3), make_model())
+    pose = fastslam.move(np.array([1.0, 2.0, 0.5]), o, np.ones(3), make_model())
     expected = [1 + forward * math.cos(0.5), 2 + forward * math.sin(0.5), 4.5 - 2 * math.pi]
     np.testing.assert_allclose(pose, expected, atol=1e-14)
 
@@ -56,7 +55,7 @@ def test_move_without_noise_translates_then_rotates(forward):
 def test_move_applies_systematic_gains():
     o = SimpleNamespace(**STILL | {"dx": 3.0, "dy": 4.0, "dtheta": 0.2, "distance": 6.0})
     model = make_model(gain_tran=1.1, gain_rot=1.5, bias_drift=0.01)
-    pose = baseline.move(np.zeros(3), o, np.zeros(3), model)
+    pose = fastslam.move(np.zeros(3), o, np.zeros(3), model)
     angle = math.atan2(4, 3) + 0.5 * 0.5 * 0.2 + 0.01 * 6 / 2
     expected = [5.5 * math.cos(angle), 5.5 * math.sin(angle), 1.5 * 0.2 + 0.06]
     np.testing.assert_allclose(pose, expected, atol=1e-14)
@@ -68,8 +67,8 @@ def test_move_covariance_is_that_of_many_small_steps(noisy):
     o = {"dx": 2.0, "dtheta": 0.3, "distance": 2.0, "turn": 0.3, "duration": 4.0}
     model = make_model(**{noisy: 0.1})
     o = SimpleNamespace(**STILL | o)
-    centre = baseline.move(np.zeros(3), o, np.zeros(3), model)
-    root = np.array([baseline.move(np.zeros(3), o, n, model) - centre for n in np.eye(3)]).T
+    centre = fastslam.move(np.zeros(3), o, np.zeros(3), model)
+    root = np.array([fastslam.move(np.zeros(3), o, n, model) - centre for n in np.eye(3)]).T
     # integrals over the path: heading noise at fraction f of the way moves the end by 2 (1 - f)
     heading = {"err_rot": 0.01 * 0.3, "err_drift": 0.01 * 2, "floor_rot": 0.01 * 4}.get(noisy, 0)
     along = {"err_tran": 0.01 * 2, "floor_tran": 0.01 * 4}.get(noisy, 0)
@@ -84,7 +83,7 @@ def test_start_has_the_given_covariance(size):
     """A root with L L' = cov, also when a variance is zero (known heading) or all are."""
     rank_two = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.0], [0.0, 0.0, 0.0]])
     for cov in (size * rank_two, size * (rank_two + np.diag([0, 0, 0.01]))):
-        made = baseline.start(np.array([1.0, 2.0, 0.5]), cov, np.eye(3), 2)
+        made = fastslam.start(np.array([1.0, 2.0, 0.5]), cov, np.eye(3), 2)
         root = np.array([particle.pose - [1, 2, 0.5] for particle in made]).T
         np.testing.assert_allclose(root @ root.T, cov, atol=1e-15)
         assert made[0].landmarks == [None, None]
@@ -97,8 +96,8 @@ def test_start_has_the_given_covariance(size):
 def best_first(table, floor):
     """Of all one-to-one choices of admissible pairs, the one whose sorted scores come first."""
     rows, slots = table.shape
-    best = ([], [baseline.NEW] * rows)
-    for choice in itertools.product([baseline.NEW, *range(slots)], repeat=rows):
+    best = ([], [fastslam.NEW] * rows)
+    for choice in itertools.product([fastslam.NEW, *range(slots)], repeat=rows):
         pairs = [(row, slot) for row, slot in enumerate(choice) if slot >= 0]
         distinct = len({slot for _, slot in pairs}) == len(pairs)
         if distinct and all(table[pair] > floor[pair[0]] for pair in pairs):
@@ -112,33 +111,33 @@ def test_exclusive_association_is_best_pair_first(seed):
     table = draw.normal(size=draw.integers(1, 5, size=2))
     table[draw.uniform(size=table.shape) < 0.2] = -np.inf
     new, clutter = draw.normal(-0.5, 0.5, len(table)), np.full(len(table), -np.inf)
-    assert baseline.associate_likeliest(table, new, clutter, True) == best_first(table, new)
+    assert fastslam.associate_likeliest(table, new, clutter, True) == best_first(table, new)
 
 
 def test_best_match_may_share_and_the_rest_is_new_or_clutter():
     table = np.array([[3.0, 2.0], [4.0, 1.0], [0.5, 0.0], [-1.0, -1.0], [np.nan, -np.inf]])
     new, clutter = np.array([0.0, 0, 1, 0, 0]), np.array([-1.0, 0, 0, 1, 0])
-    shared = baseline.associate_likeliest(table, new, clutter, False)
-    assert shared == [0, 0, baseline.NEW, baseline.CLUTTER, baseline.NEW]
-    assert baseline.associate_likeliest(table, new, clutter, True)[:2] == [1, 0]
+    shared = fastslam.associate_likeliest(table, new, clutter, False)
+    assert shared == [0, 0, fastslam.NEW, fastslam.CLUTTER, fastslam.NEW]
+    assert fastslam.associate_likeliest(table, new, clutter, True)[:2] == [1, 0]
 
 
 def test_of_hidden_bearings_one_a_frame_is_expected_to_be_new():
     model = make_model({"sensor": "bearing", "association": "maximum_likelihood"})
-    new, _ = baseline.alternatives(SimpleNamespace(value=np.array([3.0, 0.5])), model)
+    new, _ = fastslam.alternatives(SimpleNamespace(value=np.array([3.0, 0.5])), model)
     assert new == pytest.approx(math.log(0.98 / 4.0))
 
 
 @pytest.mark.parametrize("sensor", ["position", "range_bearing", "bearing"])
 def test_alternatives_by_hand(sensor):
     model = make_model({"sensor": sensor})
-    new, clutter = baseline.alternatives(SimpleNamespace(value=np.array([3.0, 0.5])), model)
+    new, clutter = fastslam.alternatives(SimpleNamespace(value=np.array([3.0, 0.5])), model)
     area = {"position": 1.0, "range_bearing": 3.0, "bearing": 50.0}[sensor]
     volume = {"position": 4 * 50.0, "range_bearing": 40.0, "bearing": 4.0}[sensor]
     assert new == pytest.approx(math.log(0.98 * 0.1 * area))
     assert clutter == pytest.approx(math.log(0.02 / volume))
     without = make_model({"sensor": sensor, "clutter": False})
-    new, clutter = baseline.alternatives(SimpleNamespace(value=np.array([3.0, 0.5])), without)
+    new, clutter = fastslam.alternatives(SimpleNamespace(value=np.array([3.0, 0.5])), without)
     assert (new, clutter) == (pytest.approx(math.log(0.1 * area)), -np.inf)
 
 
@@ -150,7 +149,7 @@ def make_particles(weights, landmarks=1):
     with np.errstate(divide="ignore"):
         logs = np.log(weights)
     return [
-        baseline.Particle(np.full(3, 0.1 * i), [*marks, None], float(log))
+        fastslam.Particle(np.full(3, 0.1 * i), [*marks, None], float(log))
         for i, log in enumerate(logs)
     ]
 
@@ -158,7 +157,7 @@ def make_particles(weights, landmarks=1):
 def test_resampling_known_weights():
     weights = np.array([0.0, 0.5, 0.0, 0.125, 0.375, 0.0])
     for uniform, expected in ((0.0, [1, 1, 1, 3, 4, 4]), (0.8, [1, 1, 1, 4, 4, 4])):
-        children, ancestors = baseline.resample(make_particles(weights), weights, uniform)
+        children, ancestors = fastslam.resample(make_particles(weights), weights, uniform)
         assert ancestors == expected  # 3 / 6 is not below c_1 = 0.5
         assert [child.pose[0] for child in children] == [0.1 * j for j in ancestors]
         assert {child.log_weight for child in children} == {-math.log(6)}
@@ -170,14 +169,14 @@ def test_resampling_never_picks_a_zero_weight():
         weights = draw.dirichlet(np.full(9, 0.3))
         weights[[0, 4, 8]] = 0
         weights /= weights.sum()
-        _, ancestors = baseline.resample(make_particles(weights), weights, uniform)
+        _, ancestors = fastslam.resample(make_particles(weights), weights, uniform)
         assert np.all(weights[ancestors] > 0)
         assert np.all(np.abs(np.bincount(ancestors, minlength=9) - 9 * weights) <= 1.1)
 
 
 def test_children_share_nothing():
     particles = make_particles([1.0, 0.0], landmarks=2)
-    (a, b), _ = baseline.resample(particles, np.array([1.0, 0.0]), 0.5)
+    (a, b), _ = fastslam.resample(particles, np.array([1.0, 0.0]), 0.5)
     a.pose[0], a.landmarks[0].mean[0], a.landmarks[0].cov[0, 0] = 50.0, 51.0, 52.0
     a.landmarks[0].anchor[0], a.landmarks[0].count, a.landmarks[1] = 53.0, 54, None
     for other in (b, particles[0]):
@@ -190,7 +189,7 @@ def test_children_share_nothing():
 def test_estimate_by_hand_across_the_wrap():
     particles = make_particles([0.25, 0.75])
     particles[0].pose, particles[1].pose = np.array([0, 0, 3.1]), np.array([4, 0, -3.1])
-    row = baseline.estimate(particles, np.array([0.25, 0.75]))
+    row = fastslam.estimate(particles, np.array([0.25, 0.75]))
     gap = 2 * (math.pi - 3.1)
     heading = math.atan2(-0.5 * math.sin(3.1), math.cos(3.1))
     np.testing.assert_allclose(row["pose_mean"], [3, 0, heading], atol=1e-12)
@@ -203,7 +202,7 @@ def test_estimate_by_hand_across_the_wrap():
 def test_lost_weights_are_counted():
     particles = make_particles([0.5, 0.5, 0.5])
     particles[1].log_weight = np.nan
-    row = baseline.normalise(particles)
+    row = fastslam.normalise(particles)
     assert (row["nonfinite"], row["degenerate"]) == (1, False)
     assert row["log_evidence"] == pytest.approx(0.0)
     assert [p.log_weight for p in particles] == [math.log(0.5), -np.inf, math.log(0.5)]

@@ -9,10 +9,10 @@ import pytest
 from scipy.optimize import least_squares
 
 from jaxslam import default_params
-from jaxslam.evaluate import truth_at, wrap
-from jaxslam.frames import frames
-from jaxslam.odometry import moments
-from jaxslam.simulate import planar
+from jaxslam.filter.frames import frames
+from jaxslam.logs.odometry import moments
+from jaxslam.logs.truth import truth_at, wrap
+from jaxslam.simulation.planar import planar
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 import batch

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxslam import borders
 from jaxslam.config import Config
+from jaxslam.filter import halo_exchange
 
 ROOT = Path(__file__).resolve().parents[1]
 N, DEVICES = 160, 4
-n, b = N // DEVICES, N // DEVICES // borders.SHARE
+n, b = N // DEVICES, N // DEVICES // halo_exchange.SHARE
 
 UPDATED = """
 import sys
@@ -86,12 +86,12 @@ def test_borders_are_enough_where_they_are():
     for amount in np.repeat(np.arange(-11, 12), 20):
         index = np.arange(N) + amount + rng.integers(-2, 3, N)
         index = np.sort(np.clip(index, 0, N - 1)).astype("i")
-        assert bool(borders.enough(index, config)) == needed(index)
+        assert bool(halo_exchange.enough(index, config)) == needed(index)
         found.append(needed(index))
     assert 20 < sum(found) < len(found) - 20
 
 
 def test_without_devices_or_particles_enough_there_are_no_borders():
-    assert borders.width(Config(particles=N)) == 0
-    assert borders.width(Config(particles=28, devices=4)) == 0
-    assert borders.width(Config(particles=N, devices=DEVICES)) == b
+    assert halo_exchange.width(Config(particles=N)) == 0
+    assert halo_exchange.width(Config(particles=28, devices=4)) == 0
+    assert halo_exchange.width(Config(particles=N, devices=DEVICES)) == b

@@ -10,7 +10,7 @@ from calibration.camera_report import draw, text
 from calibration.coverage import angle_change, azimuth_error
 from calibration.initial import first_solution
 from calibration.simulated import simulate_boards
-from jaxslam.render import double_mirror_camera
+from jaxslam.simulation.room.render import double_mirror_camera
 from jaxslam.vision.camera import Camera, ray_to_pixel
 from jaxslam.vision.camera_files import load_camera, save_camera
 

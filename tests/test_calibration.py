@@ -10,11 +10,11 @@ import pytest
 
 from calibration.odometry import motion_residuals
 from calibration.sensor import fit, turn_frame
-from jaxslam import motion
 from jaxslam.config import Params, default_params
-from jaxslam.log import Truth, load_log
-from jaxslam.paramfile import load_params, save_params
-from jaxslam.simulate import planar
+from jaxslam.logs.log import Truth, load_log
+from jaxslam.models import motion
+from jaxslam.parameter_file import load_params, save_params
+from jaxslam.simulation.planar import planar
 
 MOUNTING = (0.2, -0.1, 0.3)
 NOISE = dict(

@@ -6,8 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from jaxslam.check import check, status
-from jaxslam.log import Log, Truth, load_log
+from jaxslam.logs.diagnostics import check, status
+from jaxslam.logs.log import Log, Truth, load_log
 
 S = 10**9
 

@@ -11,8 +11,12 @@ import numpy as np
 import pytest
 from small_run import make_refined
 
-from jaxslam import cli, compare, report, runner, simulate, variants
-from jaxslam.log import load_log, save_log
+from jaxslam.cli import main as cli
+from jaxslam.logs.log import load_log, save_log
+from jaxslam.reference import compare, variants
+from jaxslam.results import run_folder
+from jaxslam.runs import run as runner
+from jaxslam.simulation import planar as simulate
 
 MANY = ("--particles", "50", "--no-refine")
 
@@ -107,7 +111,7 @@ def test_informed_and_drawn(log, call):
     code, out, _ = call(*run, "--out", "result")
     assert code == 0
     assert "path, filter" in out
-    config = report.load("result").config
+    config = run_folder.load("result").config
     assert (config.association, config.proposal) == ("sampled", "informed")
 
 
@@ -127,7 +131,7 @@ def test_overwriting_keeps_the_old_folder_until_the_new_one_is_there(log, call):
     run = "run", log, *MANY, "--out", "result"
     assert call(*run)[0] == 0
     assert call(*run, "--overwrite", "--seed", "1")[0] == 0
-    assert report.load("result").seed == 1
+    assert run_folder.load("result").seed == 1
 
 
 def test_options_of_simulate_are_those_of_the_library(at, call, monkeypatch):
@@ -327,7 +331,7 @@ def test_parameters(log, at, call, refuse):
     assert "none.toml: no such file" in refuse("compare", log, "--params", "none.toml")
     (at / "p.toml").write_text("sigma_range = 0.25\n")
     assert call("run", log, *MANY, "--params", "p.toml", "--out", "result")[0] == 0
-    found = report.load("result").params
+    found = run_folder.load("result").params
     assert found.sigma_range == 0.25
     assert found.err_tran == load_log(log).noise["err_tran"]
 

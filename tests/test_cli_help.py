@@ -6,7 +6,8 @@ import sys
 
 import pytest
 
-from jaxslam import cli, console
+from jaxslam.cli import common
+from jaxslam.cli import main as cli
 
 COMMANDS = ("demo", "run", "compare", "convert", "check", "evaluate", "plot", "learn")
 
@@ -48,15 +49,15 @@ def test_a_reader_that_goes_away_is_no_error():
 
 
 def test_a_terminal_gets_a_bar_and_a_file_does_not(capsys, monkeypatch):
-    with console.bar("filtering", compiles=True) as show:
+    with common.bar("filtering", compiles=True) as show:
         assert show is None
     assert capsys.readouterr() == ("", "")
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    with console.bar("filtering", compiles=True) as show:
+    with common.bar("filtering", compiles=True) as show:
         show(0, 8)
         show(4, 8)
-    with console.bar("refining") as show:
+    with common.bar("refining") as show:
         show(3, None)
     out, err = capsys.readouterr()
     assert out == ""

@@ -14,10 +14,10 @@ from test_cli_help import outside
 from test_images import png
 from test_points import normal, straight
 
-from jaxslam import cli
+from jaxslam.cli import main as cli
 from jaxslam.config import default_params
-from jaxslam.log import load_log, save_log
-from jaxslam.paramfile import load_params
+from jaxslam.logs.log import load_log, save_log
+from jaxslam.parameter_file import load_params
 from jaxslam.vision import extract as extraction
 from jaxslam.vision.camera_files import load_camera, save_camera
 

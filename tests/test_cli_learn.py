@@ -10,10 +10,13 @@ import jax
 import numpy as np
 import pytest
 
-from jaxslam import cli_learn, error_models, learn, simulate, uncertainty
+from jaxslam.cli import learn as cli_learn
 from jaxslam.config import Config, default_params
-from jaxslam.log import save_log
-from jaxslam.paramfile import load_learning, load_params
+from jaxslam.learning import error_models, uncertainty
+from jaxslam.learning import fit as learn
+from jaxslam.logs.log import save_log
+from jaxslam.parameter_file import load_learning, load_params
+from jaxslam.simulation import planar
 
 jax.devices()  # begun here, so that the command does not ask for more devices for all other tests
 SMALL = (
@@ -35,7 +38,7 @@ NAMES = "err_rot,sigma_bearing"
 def drives():
     """Two logs of 20 frames."""
     return [
-        simulate.planar(length_m=2.0, landmarks=8, outlier=0.0, seed=seed, max_per_frame=4)
+        planar.planar(length_m=2.0, landmarks=8, outlier=0.0, seed=seed, max_per_frame=4)
         for seed in (1, 2)
     ]
 
@@ -193,7 +196,7 @@ def test_windows_without_identities_are_left_out(logs, drives, capsys):
 def test_caution_becomes_a_part_of_what_is_learnt():
     params = default_params("bearing")
     given = Config(sensor="bearing")
-    log = simulate.planar(length_m=1.0, landmarks=3)
+    log = planar.planar(length_m=1.0, landmarks=3)
     log = dataclasses.replace(log, noise={})
     task = cli_learn._task([log], given, None, "sigma_bearing")
     assert task.params.caution == 0

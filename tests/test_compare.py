@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import baseline, compare, simulate, variants
 from jaxslam.config import SENSORS, Config, default_params
-from jaxslam.frames import frames
-from jaxslam.log import load_log
+from jaxslam.filter.frames import frames
+from jaxslam.logs.log import load_log
+from jaxslam.reference import compare, fastslam, variants
+from jaxslam.simulation import planar
 
 STEPS, PARTICLES = 200, 20
 # More than one block, a map that can fill up, and frames with more measurements than slots.
@@ -72,7 +73,7 @@ def test_baseline_and_filter_agree_on_the_papers_rules(woods):
 
 
 def small(steps=12):
-    log = simulate.planar(length_m=steps * 0.1, landmarks=12, outlier=0.2, seed=3)
+    log = planar.planar(length_m=steps * 0.1, landmarks=12, outlier=0.2, seed=3)
     return log, Config(particles=4, measurements=4, landmarks=3, proposal="prior")
 
 
@@ -126,7 +127,7 @@ def test_the_baselines_map_is_what_its_best_particle_is_sure_of():
 
 
 def test_variants_stand_side_by_side():
-    log = simulate.planar("field", 5, landmarks=15, length_m=12.0, rate_hz=2.0)
+    log = planar.planar("field", 5, landmarks=15, length_m=12.0, rate_hz=2.0)
     config = Config(particles=30, measurements=10, landmarks=30)  # test_offline's: compiled once
     pose, marks = log.truth.pose[:40] + [0.25, 0, 0], log.truth.landmarks[:9]
     world = compare.PointMap(marks + [0.25, 0.1], np.full(9, -1))
@@ -196,7 +197,7 @@ def test_differences_of_equal_runs_are_zero():
 
 def test_differences_stop_where_the_decisions_part():
     state, trace, reference = traces()
-    reference.birth[2, 1, 0] = baseline.NEW
+    reference.birth[2, 1, 0] = fastslam.NEW
     reference.poses[1, 2, 0] += 2 * np.pi + 0.25  # a full turn is no difference
     reference.poses[2] += 5
     same, pose, _, landmarks = compare._differences(state, trace, reference)
@@ -223,7 +224,7 @@ def test_different_sets_of_landmarks_are_infinitely_apart():
 
 
 def test_selected_frames_keep_their_measurements():
-    log = simulate.planar(length_m=3.0, seed=2)
+    log = planar.planar(length_m=3.0, seed=2)
     kept = np.arange(1, len(log.frame_time), 3)
     part = compare.select(log, kept)
     assert np.array_equal(part.frame_time, log.frame_time[kept])

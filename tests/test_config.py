@@ -6,16 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from jaxslam.config import (
-    ASSOCIATIONS,
-    PROPOSALS,
-    SENSORS,
-    UNITS,
-    Config,
-    Params,
-    default_params,
-)
-from jaxslam.log import Log
+from jaxslam.config import ASSOCIATIONS, PROPOSALS, SENSORS, UNITS, Config, Params, default_params
+from jaxslam.logs.log import Log
 
 
 def make_log(**changes):

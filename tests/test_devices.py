@@ -13,11 +13,12 @@ import jax
 import pytest
 from test_looks import coloured
 
-from jaxslam import cli, hosts, offline
+from jaxslam.cli import main as cli
 from jaxslam.config import Config, default_params
-from jaxslam.hosts import Place
-from jaxslam.log import save_log
-from jaxslam.simulate import planar
+from jaxslam.logs.log import save_log
+from jaxslam.runs import checkpoints, cluster
+from jaxslam.runs.cluster import Place
+from jaxslam.simulation.planar import planar
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -232,7 +233,7 @@ def meeting(*parties, limit=20.0):
 
     def one(index, place, run):
         try:
-            found[index] = hosts.meet(place, run, limit)
+            found[index] = cluster.meet(place, run, limit)
         except ConnectionError as error:
             found[index] = str(error)
 
@@ -278,7 +279,7 @@ def test_whoever_is_missing_is_named(monkeypatch):
 
 
 def test_a_missing_process_ends_the_command_with_69(at, short, call, monkeypatch):
-    monkeypatch.setattr(hosts.meet, "__defaults__", (0.5,))
+    monkeypatch.setattr(cluster.meet, "__defaults__", (0.5,))
     words = "run", short, "--num-processes", 2, "--coordinator", f"127.0.0.1:{free_port()}"
     code, out, err = call(*words, "--process-id", 0)
     assert (code, out, err.count("\n")) == (69, "", 1)
@@ -304,7 +305,7 @@ def test_options_that_do_not_fit_are_refused(at, short, refuse):
     assert cli.main([*map(str, run), "--devices", "0"]) == 2
     for address in ("localhost", ":80", "a b:1", "h:0", "h:65536", "h:x", "::1:80"):
         with pytest.raises(ValueError, match="must be HOST:PORT, like 127"):
-            hosts.place(address, 2, 1, {})
+            cluster.place(address, 2, 1, {})
     assert os.listdir() == []
 
 
@@ -326,20 +327,20 @@ MPI = {"OMPI_COMM_WORLD_SIZE": "2", "OMPI_COMM_WORLD_RANK": "1"}
     ],
 )
 def test_launchers_say_where_all_meet(env, found):
-    assert hosts.place(env=env) == (found and Place(*found))
+    assert cluster.place(env=env) == (found and Place(*found))
 
 
 def test_options_go_before_the_launcher():
-    place = hosts.place("[::1]:80", env=MPI)
+    place = cluster.place("[::1]:80", env=MPI)
     assert place == Place("::1", 80, 2, 1) and place.address == "[::1]:80"
     with pytest.raises(ValueError, match="--coordinator missing; "):
-        hosts.place(env=MPI)
+        cluster.place(env=MPI)
     # A launcher's processes with a run each.
-    assert hosts.place(processes=1, env=MPI) is hosts.place(processes=1, env=SLURM) is None
+    assert cluster.place(processes=1, env=MPI) is cluster.place(processes=1, env=SLURM) is None
 
 
 def test_a_run_is_the_same_whoever_shares_it():
-    one, two = (offline._numbers(Config(devices=d), default_params(), 0) for d in (1, 2))
+    one, two = (checkpoints._numbers(Config(devices=d), default_params(), 0) for d in (1, 2))
     assert one == two
 
 
@@ -347,5 +348,5 @@ def test_a_setting_that_an_earlier_version_did_not_have_counts_as_its_default():
     """A run of that version, put aside, is no run with looks; it is gone on with without."""
     before = {"config": {"particles": 20}}
     with_looks, without = ({"config": {"particles": 20, "descriptors": n}} for n in (6, 0))
-    assert hosts.differences(before, with_looks) == "descriptors (0, now 6)"
-    assert hosts.differences(before, without) == ""
+    assert cluster.differences(before, with_looks) == "descriptors (0, now 6)"
+    assert cluster.differences(before, without) == ""

@@ -8,15 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxslam.config import (
-    ASSOCIATIONS,
-    PROPOSALS,
-    SENSORS,
-    UNITS,
-    Config,
-    Params,
-    default_params,
-)
+from jaxslam.config import ASSOCIATIONS, PROPOSALS, SENSORS, UNITS, Config, Params, default_params
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ("equations", "algorithm", "images", "smoothing", "gradients")

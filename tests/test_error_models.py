@@ -5,14 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxslam import error_models, learn, scale, simulate
 from jaxslam.config import Config, default_params
-from jaxslam.error_models import NAMES, Judged, compare, model_of, preferred, table
-from jaxslam.runner import config_for
+from jaxslam.learning import error_models, transforms
+from jaxslam.learning import fit as learn
+from jaxslam.learning.error_models import NAMES, Judged, compare, model_of, preferred, table
+from jaxslam.runs.run import config_for
+from jaxslam.simulation import planar
 
 
 def drive(seed=1, **settings):
-    return simulate.planar(
+    return planar.planar(
         length_m=8.0, landmarks=10, seed=seed, **({"outlier": 0.0} | settings), max_per_frame=4
     )
 
@@ -43,7 +45,7 @@ def test_what_a_model_learns(model, names, clutter, growth):
 def test_what_is_learnt_as_a_logarithm_starts_above_zero():
     none = default_params()._replace(growth=0.0, outlier=0.0)
     _, params, names = model_of("heavy_tailed+range_dependent", Config(), none)
-    assert np.isfinite(scale.taken(params, names)).all()
+    assert np.isfinite(transforms.taken(params, names)).all()
     assert (params.growth, params.outlier) == (0.02, 0.01)
 
 

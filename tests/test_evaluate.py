@@ -6,8 +6,8 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 from small_run import LANDMARKS, make_refined, make_result
 
-from jaxslam import evaluate
-from jaxslam.log import Truth
+from jaxslam.logs.log import Truth
+from jaxslam.results import metrics
 
 SECOND = 1_000_000_000
 
@@ -15,7 +15,7 @@ SECOND = 1_000_000_000
 def wiggle(rng, rows=60):
     """A path [T, 3] that goes somewhere."""
     path = np.cumsum(rng.normal(0.2, 0.3, (rows, 3)), 0)
-    path[:, 2] = evaluate.wrap(path[:, 2])
+    path[:, 2] = metrics.wrap(path[:, 2])
     return path
 
 
@@ -23,41 +23,41 @@ def test_alignment_is_what_a_brute_force_optimiser_finds():
     rng = np.random.default_rng(0)
     for _ in range(5):
         truth = wiggle(rng)[:, :2]
-        estimate = evaluate.apply_se2(rng.normal(0, 2, 3), truth) + rng.normal(0, 0.3, truth.shape)
+        estimate = metrics.apply_se2(rng.normal(0, 2, 3), truth) + rng.normal(0, 0.3, truth.shape)
 
         def cost(motion, estimate=estimate, truth=truth):
-            return ((evaluate.apply_se2(motion, estimate) - truth) ** 2).sum()
+            return ((metrics.apply_se2(motion, estimate) - truth) ** 2).sum()
 
-        found = evaluate.align_se2(estimate, truth)
+        found = metrics.align_se2(estimate, truth)
         starts = [(0.0, 0.0, yaw) for yaw in np.arange(-3, 3)]
         best = min((minimize(cost, start) for start in starts), key=lambda tried: tried.fun)
         assert cost(found) <= best.fun * (1 + 1e-9)
         np.testing.assert_allclose(found[:2], best.x[:2], atol=1e-4)
-        assert abs(evaluate.wrap(found[2] - best.x[2])) < 1e-4
+        assert abs(metrics.wrap(found[2] - best.x[2])) < 1e-4
 
 
 def test_ate_ignores_where_the_path_lies_only_when_aligned():
     truth = wiggle(np.random.default_rng(1))
-    moved = evaluate.apply_se2((3.0, -1.0, 2.5), truth[:, :2])
-    assert evaluate.ate(moved, truth)[0] < 1e-12
+    moved = metrics.apply_se2((3.0, -1.0, 2.5), truth[:, :2])
+    assert metrics.ate(moved, truth)[0] < 1e-12
     distance = np.hypot(*(moved - truth[:, :2]).T)
-    rmse, most = evaluate.ate(moved, truth, align=False)
+    rmse, most = metrics.ate(moved, truth, align=False)
     assert rmse == pytest.approx(np.sqrt(np.mean(distance**2)))
     assert most == pytest.approx(distance.max())
 
 
 def test_a_mirrored_path_is_not_aligned_away():
     truth = wiggle(np.random.default_rng(2))[:, :2]
-    assert evaluate.ate(truth * [1, -1], truth)[0] > 0.5
+    assert metrics.ate(truth * [1, -1], truth)[0] > 0.5
 
 
 def test_ate_without_enough_truth_is_nan():
     truth = wiggle(np.random.default_rng(3))
     truth[2:, :2] = np.nan
-    assert np.isnan(evaluate.ate(truth, truth)[0])
-    assert evaluate.ate(truth, truth, align=False)[0] == 0
+    assert np.isnan(metrics.ate(truth, truth)[0])
+    assert metrics.ate(truth, truth, align=False)[0] == 0
     standing = np.ones((9, 3))
-    assert np.isnan(evaluate.ate(standing, standing)[0])
+    assert np.isnan(metrics.ate(standing, standing)[0])
 
 
 def test_truth_is_interpolated_across_the_turn_and_not_across_gaps():
@@ -65,8 +65,8 @@ def test_truth_is_interpolated_across_the_turn_and_not_across_gaps():
     pose = np.array([[0, 0, 3.0], [1, 2, -3.0], [2, 2, -2.8], [9, 9, 0], [10, 9, 0.2]])
     truth = Truth((seconds * SECOND).astype(np.int64), pose)
     asked = np.array([-0.1, 0.0, 0.25, 1.01, 1.1, 3.0, 5.25, 5.6])
-    found = evaluate.truth_at(truth, (asked * SECOND).astype(np.int64))
-    half = evaluate.wrap((3.0 + (2 * np.pi - 3.0)) / 2)  # between 3 and -3 lies pi, not 0
+    found = metrics.truth_at(truth, (asked * SECOND).astype(np.int64))
+    half = metrics.wrap((3.0 + (2 * np.pi - 3.0)) / 2)  # between 3 and -3 lies pi, not 0
     np.testing.assert_allclose(found[2], [0.5, 1.0, half], atol=1e-9)
     np.testing.assert_allclose(found[6], [9.5, 9, 0.1], atol=1e-9)
     np.testing.assert_array_equal(found[[1, 3]], pose[[0, 2]])  # the sample itself; within 20 ms
@@ -77,23 +77,23 @@ def test_single_readings_count_at_their_stops():
     time = np.arange(5) * 10 * SECOND
     truth = Truth(time, np.arange(15.0).reshape(5, 3) / 5, resolution=0.3)
     between = np.sort(np.concatenate([time, time + 4 * SECOND]))
-    found = evaluate.truth_at(truth, between)
+    found = metrics.truth_at(truth, between)
     np.testing.assert_allclose(found[::2], truth.pose)
     assert np.isnan(found[1::2]).all()
     single = Truth(time[:1], truth.pose[:1])
-    assert np.isfinite(evaluate.truth_at(single, time)).all(1).tolist() == [True] + [False] * 4
+    assert np.isfinite(metrics.truth_at(single, time)).all(1).tolist() == [True] + [False] * 4
 
 
 def test_relative_error_is_that_of_a_scale_and_of_a_bend():
     steps = np.arange(0, 20, 0.05)
     truth = np.stack([steps, 0 * steps, 0 * steps], 1)
-    length, turn = evaluate.rpe(truth * [1.03, 1, 1], truth, distance=2.0)
+    length, turn = metrics.rpe(truth * [1.03, 1, 1], truth, distance=2.0)
     assert length == pytest.approx(0.06, rel=0.03)
     assert turn == 0
     bent = np.stack([np.sin(steps / 10) * 10, 10 - np.cos(steps / 10) * 10, steps / 10], 1)
-    assert evaluate.rpe(bent, truth, distance=2.0)[1] == pytest.approx(0.2, rel=0.03)
+    assert metrics.rpe(bent, truth, distance=2.0)[1] == pytest.approx(0.2, rel=0.03)
     time = np.arange(steps.size) * SECOND // 10
-    by_time = evaluate.rpe(truth * [1.03, 1, 1], truth, time=time, seconds=4.0)
+    by_time = metrics.rpe(truth * [1.03, 1, 1], truth, time=time, seconds=4.0)
     assert by_time[0] == pytest.approx(0.06, rel=0.03)
 
 
@@ -101,12 +101,12 @@ def test_relative_error_does_not_care_for_frames_nor_for_standing_still():
     rng = np.random.default_rng(4)
     truth = wiggle(rng, 300)
     estimate = truth + np.cumsum(rng.normal(0, 0.01, truth.shape), 0)
-    plain = evaluate.rpe(estimate, truth)
+    plain = metrics.rpe(estimate, truth)
     c, s = np.cos(1.0), np.sin(1.0)
     turned = estimate @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + [5, 5, 1.0]
-    np.testing.assert_allclose(evaluate.rpe(turned, truth), plain, rtol=1e-9)
+    np.testing.assert_allclose(metrics.rpe(turned, truth), plain, rtol=1e-9)
     stood = np.repeat(np.arange(300), np.where(np.arange(300) == 0, 1000, 1))
-    np.testing.assert_allclose(evaluate.rpe(estimate[stood], truth[stood]), plain, rtol=0.02)
+    np.testing.assert_allclose(metrics.rpe(estimate[stood], truth[stood]), plain, rtol=0.02)
 
 
 def test_relative_error_skips_pieces_that_span_missing_truth():
@@ -115,7 +115,7 @@ def test_relative_error_skips_pieces_that_span_missing_truth():
     estimate = truth.copy()
     estimate[50:, 0] += 100.0
     estimate[45:55] = truth[45:55] = np.nan
-    assert evaluate.rpe(estimate, truth, distance=0.5)[0] == pytest.approx(0, abs=1e-9)
+    assert metrics.rpe(estimate, truth, distance=0.5)[0] == pytest.approx(0, abs=1e-9)
 
 
 def test_nees_of_drawn_gaussians_is_chi_squared():
@@ -124,8 +124,8 @@ def test_nees_of_drawn_gaussians_is_chi_squared():
     cov = factor @ factor.transpose(0, 2, 1) + 1e-6 * np.eye(3)
     truth = rng.uniform(-3, 3, size=(4000, 3))
     pose = truth + np.einsum("tij,tj->ti", np.linalg.cholesky(cov), rng.normal(size=(4000, 3)))
-    pose[:, 2] = evaluate.wrap(pose[:, 2])  # across the turn an error is still small
-    found = evaluate.nees(pose, cov, truth)
+    pose[:, 2] = metrics.wrap(pose[:, 2])  # across the turn an error is still small
+    found = metrics.nees(pose, cov, truth)
     low, high = chi2.ppf([5e-4, 1 - 5e-4], 3 * 4000) / 4000
     assert low < found.mean() < high
     assert np.mean(found < chi2.ppf(0.99, 3)) == pytest.approx(0.99, abs=0.006)
@@ -137,23 +137,23 @@ def test_nees_is_nan_without_truth_or_with_a_singular_covariance():
     truth[1] = np.nan
     cov[2, 0, 1] = cov[2, 1, 0] = 1
     cov[3] = 0
-    found = evaluate.nees(pose, cov, truth)
+    found = metrics.nees(pose, cov, truth)
     assert found[0] == pytest.approx(0.03)
     assert np.isnan(found[1:]).all()
-    rounded = evaluate.nees(pose, cov, truth, resolution=np.sqrt(12))
+    rounded = metrics.nees(pose, cov, truth, resolution=np.sqrt(12))
     assert rounded[0] == pytest.approx(0.01 + 2 * 0.005)
 
 
 def test_gate_is_half_the_smallest_spacing_and_at_most_half_a_metre():
-    assert evaluate.landmark_gate(np.array([[0, 0], [9, 0], [9, 0.4]])) == pytest.approx(0.2)
-    assert evaluate.landmark_gate(LANDMARKS) == 0.5
-    assert evaluate.landmark_gate(LANDMARKS[:1]) == 0.5
+    assert metrics.landmark_gate(np.array([[0, 0], [9, 0], [9, 0.4]])) == pytest.approx(0.2)
+    assert metrics.landmark_gate(LANDMARKS) == 0.5
+    assert metrics.landmark_gate(LANDMARKS[:1]) == 0.5
 
 
 def test_hidden_identities_pair_one_to_one_within_the_gate():
     truth = Truth(landmarks=np.array([[0, 0], [0.8, 0], [5, 5], [9, 9]]))
     mean = np.array([[0.1, 0], [0.2, 0], [0.7, 0.1], [5, 5.41], [7, 7]])
-    found = evaluate.map_error(mean, np.full(5, -1), truth)
+    found = metrics.map_error(mean, np.full(5, -1), truth)
     assert (found["matched"], found["missed"], found["spurious"]) == (2, 2, 3)
     assert found["gate_m"] == pytest.approx(0.4)
     assert found["rmse_m"] == pytest.approx(np.sqrt((0.1**2 + 0.1**2 + 0.1**2) / 2))
@@ -162,26 +162,26 @@ def test_hidden_identities_pair_one_to_one_within_the_gate():
 def test_pairing_is_the_best_over_all_and_not_greedy():
     landmarks = np.array([[0.0, 0], [1, 0], [2, 0]])
     mean = np.array([[0.6, 0], [1.6, 0], [2.7, 0]])  # the nearest pairs leave the last alone
-    pairs = evaluate.pair_by_distance(mean, landmarks, 0.75)
+    pairs = metrics.pair_by_distance(mean, landmarks, 0.75)
     assert sorted(map(tuple, pairs)) == [(0, 0), (1, 1), (2, 2)]
-    assert evaluate.pair_by_distance(np.zeros((0, 2)), landmarks, 1).shape == (0, 2)
+    assert metrics.pair_by_distance(np.zeros((0, 2)), landmarks, 1).shape == (0, 2)
 
 
 def test_known_identities_pair_by_identity_without_a_gate():
     truth = Truth(landmarks=LANDMARKS, landmark_id=np.array([4, 3, 2, 1]))
-    found = evaluate.map_error(LANDMARKS[::-1] + np.array([2, 0]), np.array([1, 2, 3, 99]), truth)
+    found = metrics.map_error(LANDMARKS[::-1] + np.array([2, 0]), np.array([1, 2, 3, 99]), truth)
     assert found == dict(matched=3, missed=1, spurious=1, rmse_m=pytest.approx(2.0))
-    swapped = evaluate.map_error(LANDMARKS, np.array([1, 2, 3, 4]), truth)
+    swapped = metrics.map_error(LANDMARKS, np.array([1, 2, 3, 4]), truth)
     assert swapped["rmse_m"] > 4  # right places, wrong names
 
 
 def test_an_empty_map_misses_everything():
-    found = evaluate.map_error(np.zeros((0, 2)), np.zeros(0, int), Truth(landmarks=LANDMARKS))
+    found = metrics.map_error(np.zeros((0, 2)), np.zeros(0, int), Truth(landmarks=LANDMARKS))
     assert found == dict(matched=0, missed=4, spurious=0, gate_m=0.5)
 
 
 def test_errors_of_a_shifted_run_are_the_shift_and_nothing_after_alignment():
-    found = evaluate.errors(make_result(shift=0.1))
+    found = metrics.errors(make_result(shift=0.1))
     assert found["ate_filtered_rmse_m"] == pytest.approx(0, abs=1e-9)
     assert found["ate_filtered_unaligned_rmse_m"] == pytest.approx(0.1)
     assert found["ate_filtered_unaligned_max_m"] == pytest.approx(0.1)
@@ -199,7 +199,7 @@ def test_errors_of_a_shifted_run_are_the_shift_and_nothing_after_alignment():
 
 
 def test_what_looks_back_is_measured_as_the_filter_is():
-    plain, found = evaluate.errors(make_result()), evaluate.errors(make_refined())
+    plain, found = metrics.errors(make_result()), metrics.errors(make_refined())
     assert plain.items() <= found.items()
     assert not [key for key in plain if "refined" in key or "ancestral" in key]
     for name, off in (("filtered", 0.1), ("ancestral", 0.08), ("refined", 0.05)):
@@ -222,15 +222,15 @@ def test_what_looks_back_is_measured_as_the_filter_is():
 
 def test_errors_leave_out_what_cannot_be_computed():
     result = make_result()
-    assert evaluate.errors(make_result(truth=False)) == {}
+    assert metrics.errors(make_result(truth=False)) == {}
     only_map = dataclasses.replace(result.log, truth=Truth(landmarks=LANDMARKS))
-    assert set(evaluate.errors(result, only_map)) == {
+    assert set(metrics.errors(result, only_map)) == {
         "landmark_filtered_unaligned_rmse_m",
         "landmark_gate_m",
         *(f"landmarks_unaligned_{kind}" for kind in ("matched", "missed", "spurious")),
     }
     coarse = dataclasses.replace(result.log.truth, resolution=0.3, landmarks=None, landmark_id=None)
-    found = evaluate.errors(result, dataclasses.replace(result.log, truth=coarse))
+    found = metrics.errors(result, dataclasses.replace(result.log, truth=coarse))
     assert found["truth_resolution_m"] == 0.3
     assert not [key for key in found if key.startswith(("rpe", "landmark"))]
 
@@ -255,7 +255,7 @@ def with_match(result, frame, slot, value):
 def test_association_accuracy_counts_each_kind_of_mistake(frame, slot, value):
     result = make_result()
     wrong = with_match(result, frame, slot, value)
-    assert evaluate.association_accuracy(wrong) == pytest.approx(1 - 1 / 80)
+    assert metrics.association_accuracy(wrong) == pytest.approx(1 - 1 / 80)
 
 
 def test_association_accuracy_falls_back_on_measured_identities():
@@ -263,5 +263,5 @@ def test_association_accuracy_falls_back_on_measured_identities():
     measured = dataclasses.replace(result.log, truth=None, identity=result.log.truth.identity)
     wrong = with_match(result, 8, 0, -2)
     # Without truth, -1 is a measurement without identity, so 40 of 80 count.
-    assert evaluate.association_accuracy(wrong, measured) == pytest.approx(1 - 1 / 40)
-    assert np.isnan(evaluate.association_accuracy(make_result(truth=False)))
+    assert metrics.association_accuracy(wrong, measured) == pytest.approx(1 - 1 / 40)
+    assert np.isnan(metrics.association_accuracy(make_result(truth=False)))

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import filter as fastslam
 from jaxslam.config import Config, default_params
-from jaxslam.motion import Odometry, model
-from jaxslam.sensors import Measurements
+from jaxslam.filter import step as fastslam
+from jaxslam.models.motion import Odometry, model
+from jaxslam.models.sensors import Measurements
 
 STEPS, RUNS, LANDMARKS = 6, 10_000, 3
 START = np.array([0.3, -0.2, 0.4])

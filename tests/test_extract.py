@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from jaxslam.config import default_params
-from jaxslam.log import load_log
-from jaxslam.render import double_mirror_camera, render_room
+from jaxslam.logs.log import load_log
+from jaxslam.simulation.room.render import double_mirror_camera, render_room
 from jaxslam.vision import extract as module
 from jaxslam.vision.extract import extract
 from jaxslam.vision.lines import LineSettings
+from jaxslam.vision.log_triangulation import PointSettings
 from jaxslam.vision.matching import appearance_of, match
-from jaxslam.vision.points import PointSettings
 
 CAMERA = double_mirror_camera()
 ROBOT = default_params("position")._replace(

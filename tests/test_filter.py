@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import association, motion
-from jaxslam import filter as fastslam
 from jaxslam.config import SENSORS, Config, default_params
-from jaxslam.evaluate import ate
-from jaxslam.frames import frames
-from jaxslam.runner import config_for, run
-from jaxslam.simulate import planar
+from jaxslam.filter import association
+from jaxslam.filter import step as fastslam
+from jaxslam.filter.frames import frames
+from jaxslam.models import motion
+from jaxslam.results.metrics import ate
+from jaxslam.runs.run import config_for, run
+from jaxslam.simulation.planar import planar
 
 STEPS, PARTICLES, BLIND = 40, 16, 15
 DRAWN = dict(proposal="informed", association="sampled")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from jaxslam.config import Params, default_params
-from jaxslam.frames import frames
-from jaxslam.log import Log, load_log
-from jaxslam.odometry import dead_reckoning, increments
+from jaxslam.filter.frames import frames
+from jaxslam.logs.log import Log, load_log
+from jaxslam.logs.odometry import dead_reckoning, increments
 
 S = 10**9
 

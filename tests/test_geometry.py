@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import geometry
+from jaxslam.models import geometry
 
 
 def test_wrap_brings_any_angle_into_half_open_interval(x64):

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from jaxslam import config_for, default_params, run
-from jaxslam.evaluate import pair_by_distance, truth_at
-from jaxslam.furnish import furnish
-from jaxslam.render import render_room
+from jaxslam.logs.truth import truth_at
+from jaxslam.results.metrics import pair_by_distance
+from jaxslam.simulation.room.furniture import furnish
+from jaxslam.simulation.room.render import render_room
 from jaxslam.vision.camera_files import load_camera
 from jaxslam.vision.extract import extract
 

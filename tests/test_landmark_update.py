@@ -7,9 +7,11 @@ import pytest
 from landmark_cases import COV, PARAMS, SENSOR_POSE, case, matrix, padded, predict, wrap
 from scipy.stats import multivariate_normal
 
-from jaxslam import baseline_ekf, geometry, landmarks, sensors
-from jaxslam.baseline import make_model
 from jaxslam.config import SENSORS, Config
+from jaxslam.filter import landmarks
+from jaxslam.models import geometry, sensors
+from jaxslam.reference import ekf
+from jaxslam.reference.fastslam import make_model
 
 
 def jacobian(sensor, mean, anchor, h=1e-6):
@@ -134,10 +136,10 @@ def test_update_is_the_baselines(x64, sensor, seed):
     got, root, density = landmarks.update(
         sensor, SENSOR_POSE, tuple(mean), tuple(factor), anchor, padded(value), COV, PARAMS
     )
-    other = baseline_ekf.Landmark(mean.copy(), cov.copy(), anchor, 1, 0.0, 0)
+    other = ekf.Landmark(mean.copy(), cov.copy(), anchor, 1, 0.0, 0)
     measured = type("Measured", (), {"value": value, "cov": matrix(COV)})
     model = make_model(PARAMS, Config(sensor=sensor))
-    expected = baseline_ekf.update(other, measured, SENSOR_POSE, model)
+    expected = ekf.update(other, measured, SENSOR_POSE, model)
     np.testing.assert_allclose(got, other.mean, atol=1e-11)
     np.testing.assert_allclose(matrix(geometry.covariance(root)), other.cov, atol=1e-11)
     assert float(density) == pytest.approx(expected, abs=1e-9)

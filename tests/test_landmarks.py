@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from landmark_cases import COV, PARAMS, SENSOR_POSE, matrix, padded, predict, world_of
 
-from jaxslam import association, baseline_ekf, births, geometry, landmarks, matched, sensors
-from jaxslam.baseline import make_model
 from jaxslam.config import SENSORS, Config
-from jaxslam.sensors import Measurements
+from jaxslam.filter import association, landmark_updates, landmarks, new_landmarks
+from jaxslam.models import geometry, sensors
+from jaxslam.models.sensors import Measurements
+from jaxslam.reference import ekf
+from jaxslam.reference.fastslam import make_model
 
 
 def frame_of(sensor, world, match):
@@ -61,11 +63,11 @@ def test_score_is_the_updates_log_density(x64, sensor):
             )  # fmt: skip
             if sensor == "bearing":
                 cov = matrix(geometry.covariance(world.factor[:, m, n]))
-                mark = baseline_ekf.Landmark(world.mean[:, m, n], cov, anchor, 1, 0.0, 0)
+                mark = ekf.Landmark(world.mean[:, m, n], cov, anchor, 1, 0.0, 0)
                 model = make_model(PARAMS, Config(sensor=sensor))
-                expected = baseline_ekf.predict(mark, SENSOR_POSE, model)
+                expected = ekf.predict(mark, SENSOR_POSE, model)
                 measured = SimpleNamespace(value=np.array(value[:1]), cov=None)
-                density = baseline_ekf.innovation(mark, measured, expected, model)[2].item()
+                density = ekf.innovation(mark, measured, expected, model)[2].item()
             expected = np.log(0.9) + float(density) if world.count[m, n] else -np.inf
             assert float(got[m, n]) == pytest.approx(expected, abs=1e-9)
 
@@ -76,7 +78,7 @@ def test_matched_landmarks_are_updated_marked_and_weighed(x64, sensor):
     # The last two measurements share a landmark in the second particle.
     match = jnp.array([[1, -1], [-2, 2], [0, 2], [-3, -3]])
     frame = frame_of(sensor, world, match)
-    got, density = matched.updated(sensor, poses(2), world, match, frame, PARAMS, True)
+    got, density = landmark_updates.updated(sensor, poses(2), world, match, frame, PARAMS, True)
     for n in range(2):
         total = 0.0
         mean, factor = np.array(world.mean[:, :, n]), np.array(world.factor[:, :, n])
@@ -106,14 +108,14 @@ def test_rows_of_known_identities_are_updated_as_the_map_is(x64, sensor):
     match = jnp.array([[1, -1], [1, 1], [0, -2], [-3, -3], [-1, -1], [1, 1]])
     identity = jnp.array([1, 1, 0, 2, 7, 1])
     frame = frame_of(sensor, world, match)._replace(identity=identity)
-    rows = matched.rows_of(frame, 3)
+    rows = landmark_updates.rows_of(frame, 3)
     np.testing.assert_array_equal(rows.slot, [1, 1, 0, 3, 3, 1])
     np.testing.assert_array_equal(rows.earlier, [0, 1, 0, 0, 0, 2])
     part = jax.tree.map(lambda leaf: leaf[..., jnp.minimum(rows.slot, 2), :], world)
-    fit = matched.fitted(sensor, poses(2), part, frame, PARAMS)
+    fit = landmark_updates.fitted(sensor, poses(2), part, frame, PARAMS)
     given = rows, match, frame, PARAMS
-    got, density = matched.updated_rows(sensor, poses(2), part, *given, fit)
-    whole, expected = matched.updated(sensor, poses(2), world, match, frame, PARAMS, True)
+    got, density = landmark_updates.updated_rows(sensor, poses(2), part, *given, fit)
+    whole, expected = landmark_updates.updated(sensor, poses(2), world, match, frame, PARAMS, True)
     whole = landmarks.settle(whole)
     for k, slot in ((0, 1), (2, 0)):
         for name in ("mean", "factor", "count"):
@@ -131,7 +133,9 @@ def test_births_take_slots_that_no_particle_uses_in_the_measurements_order(x64, 
     frame = frame_of(sensor, world, match)
     free = jnp.array([1, 4, 5, 5])  # slot 3 is in use elsewhere
     whole = jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, 0)] * (leaf.ndim - 1) + [(1, 1)]), world)
-    whole, touched, lost = births.create(config, whole, 1, poses(3), match, free, frame, PARAMS, 10)
+    whole, touched, lost = new_landmarks.create(
+        config, whole, 1, poses(3), match, free, frame, PARAMS, 10
+    )
     got = jax.tree.map(lambda leaf: leaf[..., 1:-1], whole)
     np.testing.assert_array_equal(whole.count[:, [0, -1]], 0)
     np.testing.assert_array_equal(lost, [0, 0, 1])
@@ -161,7 +165,7 @@ def test_what_has_odds_against_it_from_the_start_is_no_landmark(x64):
     frame = frame_of("range_bearing", world, match)
     params = PARAMS._replace(existence_new=-0.1)
     free = jnp.array([0])
-    got, *_ = births.create(config, world, 0, poses(2), match, free, frame, params, 0)
+    got, *_ = new_landmarks.create(config, world, 0, poses(2), match, free, frame, params, 0)
     np.testing.assert_array_equal(got.count, [[0, 0]])
 
 
@@ -171,7 +175,9 @@ def test_known_identities_go_to_their_slot(x64):
     match = jnp.array([[-1, -1], [0, -1], [-1, -1], [-3, -3]])
     frame = frame_of("range_bearing", world, match)
     frame = frame._replace(identity=jnp.array([2, 0, 5, -1], jnp.int32))
-    got, touched, lost = births.create(config, world, 0, poses(2), match, None, frame, PARAMS, 1)
+    got, touched, lost = new_landmarks.create(
+        config, world, 0, poses(2), match, None, frame, PARAMS, 1
+    )
     np.testing.assert_array_equal(got.count, [[1, 1], [0, 0], [1, 1]])
     np.testing.assert_array_equal(lost, [1, 1])  # identity 5 has no slot
     np.testing.assert_array_equal(touched, [True, False, True])
@@ -235,7 +241,7 @@ def test_a_given_map_fills_the_first_slots_of_every_particle(x64, sensor):
     rng = np.random.default_rng(0)
     given = rng.normal(size=(2, 2)), rng.uniform(0.1, 1, (3, 2)), rng.normal(size=(2, 2))
     given = given if sensor == "bearing" else given[:2]
-    world = births.given(landmarks.empty(config, jnp.zeros(()).dtype), given)
+    world = new_landmarks.given(landmarks.empty(config, jnp.zeros(()).dtype), given)
     for n in range(3):
         np.testing.assert_array_equal(world.mean[:, :2, n], given[0])
         np.testing.assert_array_equal(world.factor[:, :2, n], given[1])
@@ -250,7 +256,7 @@ def test_a_given_map_fills_the_first_slots_of_every_particle(x64, sensor):
 def test_a_given_map_must_fit():
     world = landmarks.empty(Config(particles=2, landmarks=1), jnp.float32)
     with pytest.raises(ValueError, match="2 landmarks given, but the map has 1 slots"):
-        births.given(world, (np.zeros((2, 2)), np.ones((3, 2))))
+        new_landmarks.given(world, (np.zeros((2, 2)), np.ones((3, 2))))
 
 
 @pytest.mark.parametrize("sensor", SENSORS)

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from landmark_cases import PARAMS, matrix, world_of
 
-from jaxslam import geometry, landmarks
 from jaxslam.config import Config
+from jaxslam.filter import landmarks
+from jaxslam.models import geometry
 
 
 def test_inverse_depth_in_the_world_against_draws(x64):

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import filter as fastslam
-from jaxslam import learn, likelihood, scale, simulate
 from jaxslam.config import Config, Params, default_params
-from jaxslam.odometry import Odometry
-from jaxslam.sensors import Measurements
+from jaxslam.filter import step as fastslam
+from jaxslam.learning import fit, likelihood, transforms
+from jaxslam.logs.odometry import Odometry
+from jaxslam.models.sensors import Measurements
+from jaxslam.simulation import planar
 
 NAMES = ("sigma_bearing", "sigma_range", "mount_yaw")
 CONFIG = Config(
@@ -23,7 +24,7 @@ CONFIG = Config(
 
 
 def drive(seed):
-    return simulate.planar(
+    return planar.planar(
         "field", seed, landmarks=12, length_m=8, rate_hz=2.5, odometry_hz=12.5, max_per_frame=6,
         outlier=0.0, sigma_bearing=0.03, sigma_range=0.1, mounting=(0.0, 0.0, 0.1),
     )  # fmt: skip
@@ -43,33 +44,33 @@ def start(logs):
 @pytest.mark.parametrize("name", ["err_rot", "outlier", "mount_yaw", "gain_rot"])
 def test_the_free_scale_there_and_back(x64, name):
     for value in (0.02, 0.3):
-        free = scale.to_free(name, value)
-        assert float(scale.from_free(name, free)) == pytest.approx(value, rel=1e-12)
-    assert float(scale.from_free(name, -40.0)) >= (-4.0 if name == "mount_yaw" else 0.0)
+        free = transforms.to_free(name, value)
+        assert float(transforms.from_free(name, free)) == pytest.approx(value, rel=1e-12)
+    assert float(transforms.from_free(name, -40.0)) >= (-4.0 if name == "mount_yaw" else 0.0)
 
 
 def test_what_starts_at_zero_has_no_logarithm(start):
     with pytest.raises(ValueError, match="growth is 0: to be learnt it must start above 0"):
-        scale.taken(start, ("growth",))
+        transforms.taken(start, ("growth",))
 
 
 def test_the_usual_choice_leaves_the_scale_to_the_odometry_when_there_are_bearings_only():
-    assert "gain_tran" not in learn.default_names(Config(sensor="bearing"))
-    assert "gain_tran" in learn.default_names(Config(sensor="range_bearing"))
-    assert "outlier" not in learn.default_names(CONFIG)
+    assert "gain_tran" not in fit.default_names(Config(sensor="bearing"))
+    assert "gain_tran" in fit.default_names(Config(sensor="range_bearing"))
+    assert "outlier" not in fit.default_names(CONFIG)
 
 
 def test_a_fit_comes_close_and_goes_on_from_its_checkpoint(logs, start, tmp_path):
     told = dict(held_out=[drive(3)], seeds=2, steps=40, rate=0.2, every=20, held_out_seeds=2)
     told |= dict(bounds={"sigma_range": (0.03, 0.2)}, checkpoint=tmp_path / "fit.npz")
-    whole = learn.fit(logs, CONFIG, start, NAMES, **told)
+    whole = fit.fit(logs, CONFIG, start, NAMES, **told)
     found = whole.params
     # The last iterates still swing about what 200 measurements tell.
     assert found.sigma_bearing == pytest.approx(0.03, rel=0.3)
     assert found.sigma_range == pytest.approx(0.1, rel=0.5)
     assert found.mount_yaw == pytest.approx(0.1, abs=0.03)
     assert found.err_tran == start.err_tran
-    assert whole.history.held_out[-1] > learn.evidence([drive(3)], CONFIG, start, 2).mean() + 20
+    assert whole.history.held_out[-1] > fit.evidence([drive(3)], CONFIG, start, 2).mean() + 20
     assert whole.history.log_likelihood[-1] > whole.history.log_likelihood[0]
     assert (whole.steps, len(whole.history.free), whole.stopped) == (40, 40, "all steps done")
 
@@ -81,24 +82,24 @@ def test_a_fit_comes_close_and_goes_on_from_its_checkpoint(logs, start, tmp_path
             raise Cut
 
     with pytest.raises(Cut):
-        learn.fit(logs, CONFIG, start, NAMES, progress=stop, **told)
-    again = learn.fit(logs, CONFIG, start, NAMES, resume=True, **told)
+        fit.fit(logs, CONFIG, start, NAMES, progress=stop, **told)
+    again = fit.fit(logs, CONFIG, start, NAMES, resume=True, **told)
     np.testing.assert_array_equal(again.free, whole.free)
     np.testing.assert_array_equal(again.history.free, whole.history.free)
     with pytest.raises(ValueError, match="belongs to a fit of other logs or settings"):
-        learn.fit(logs, CONFIG, start, NAMES, resume=True, **(told | {"seeds": 3}))
+        fit.fit(logs, CONFIG, start, NAMES, resume=True, **(told | {"seeds": 3}))
     (tmp_path / "fit.npz").write_bytes(b"PK no zip")
     with pytest.raises(ValueError, match="not a checkpoint, or damaged"):
-        learn.fit(logs, CONFIG, start, NAMES, resume=True, **told)
+        fit.fit(logs, CONFIG, start, NAMES, resume=True, **told)
 
 
 def test_bounds_hold_and_priors_pull(logs, start):
     told = dict(seeds=2, steps=8, rate=0.2)
     low = start.sigma_range
-    bound = learn.fit(logs, CONFIG, start, NAMES, bounds={"sigma_range": (0.01, 1.2 * low)}, **told)
+    bound = fit.fit(logs, CONFIG, start, NAMES, bounds={"sigma_range": (0.01, 1.2 * low)}, **told)
     assert bound.params.sigma_range == pytest.approx(1.2 * low, rel=1e-3)
-    free = learn.fit(logs, CONFIG, start, NAMES, **told)
-    pulled = learn.fit(logs, CONFIG, start, NAMES, priors={"mount_yaw": (0.0, 1e-3)}, **told)
+    free = fit.fit(logs, CONFIG, start, NAMES, **told)
+    pulled = fit.fit(logs, CONFIG, start, NAMES, priors={"mount_yaw": (0.0, 1e-3)}, **told)
     assert abs(pulled.params.mount_yaw) < 0.05 < free.params.mount_yaw
 
 
@@ -115,15 +116,15 @@ def test_bounds_hold_and_priors_pull(logs, start):
 )
 def test_what_can_not_be_learnt_is_refused(logs, start, names, told, found):
     with pytest.raises(ValueError, match=found):
-        learn.fit(logs, CONFIG, start, names, **told)
+        fit.fit(logs, CONFIG, start, names, **told)
     with pytest.raises(ValueError, match="no log"):
-        learn.fit([], CONFIG, start, ("sigma_range",))
+        fit.fit([], CONFIG, start, ("sigma_range",))
 
 
 def test_the_best_match_is_learnt_with_a_warning(logs, start):
     biased = dataclasses.replace(CONFIG, association="maximum_likelihood", forgetting=None)
     with pytest.warns(UserWarning, match="biases the score"), pytest.raises(ValueError):
-        learn.fit([], biased, start, ("sigma_range",))
+        fit.fit([], biased, start, ("sigma_range",))
 
 
 TWO_DEVICES = """

@@ -5,11 +5,12 @@ import csv
 import numpy as np
 import pytest
 
-from jaxslam import learn_report, surface
 from jaxslam.config import Config, default_params
-from jaxslam.learn import Fit, History
-from jaxslam.learn_report import Judged
-from jaxslam.uncertainty import Uncertainty
+from jaxslam.learning import report as learn_report
+from jaxslam.learning import surface
+from jaxslam.learning.fit import Fit, History
+from jaxslam.learning.report import Judged
+from jaxslam.learning.uncertainty import Uncertainty
 
 NAMES = ("err_rot", "sigma_bearing", "mount_yaw")
 STEPS = 20

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from test_proposal import ODOMETRY, drive_among_marks
 
-from jaxslam import filter as fastslam
-from jaxslam import likelihood, motion, observation, resampling
 from jaxslam.config import Config, default_params
-from jaxslam.likelihood import OF_MOTION, Data
-from jaxslam.simulate import planar
+from jaxslam.filter import block_update, resampling
+from jaxslam.filter import step as fastslam
+from jaxslam.learning import likelihood
+from jaxslam.learning.likelihood import OF_MOTION, Data
+from jaxslam.models import motion
+from jaxslam.simulation.planar import planar
 
 KEY = jax.random.key(4)
 
@@ -82,7 +84,7 @@ def backwards(params, data, config, names, discount):
         def step(carry, frame):
             state, inherited = carry
             chance = likelihood.draws(key, state.step, config)
-            seen = observation.observe(state, chance, *frame, given, config, True)
+            seen = block_update.observe(state, chance, *frame, given, config, True)
             drawn = motion.log_density(hold(seen.pose), hold(state.pose), frame[0], given)
             own = discount * inherited + seen.density + drawn
             after, info = fastslam.conclude(chance, *hold((state, seen)), frame[1], config)

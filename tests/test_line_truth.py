@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxslam.evaluate import truth_at, wrap
-from jaxslam.furnish import furnish
-from jaxslam.log import Log, Truth
-from jaxslam.room import visible_edges
+from jaxslam.logs.log import Log, Truth
+from jaxslam.logs.truth import truth_at, wrap
+from jaxslam.simulation.room.furniture import furnish
+from jaxslam.simulation.room.geometry import visible_edges
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 from line_truth import identified

@@ -9,10 +9,10 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 from stripes import mirror_camera, painted, photograph, room_of_stripes, stripes
 
-from jaxslam.furnish import furnish
-from jaxslam.render import PRESETS, double_mirror_camera, frames
-from jaxslam.room import visible_edges
-from jaxslam.vision.line_pairs import merged, separated
+from jaxslam.simulation.room.furniture import furnish
+from jaxslam.simulation.room.geometry import visible_edges
+from jaxslam.simulation.room.render import PRESETS, double_mirror_camera, frames
+from jaxslam.vision.line_merging import merged, separated
 from jaxslam.vision.lines import Lines, LineSettings, extract_lines, halves, is_dark
 from jaxslam.vision.overlay import draw_lines, draw_on_image
 from jaxslam.vision.panorama import panorama, unwrap

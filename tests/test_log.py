@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxslam.log import FloorPlan, Log, Truth, load_log, save_log
+from jaxslam.logs.log import FloorPlan, Log, Truth, load_log, save_log
 
 S = 10**9
 GAP = [np.nan] * 3

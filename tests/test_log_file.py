@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from test_log import assert_same, make
 
-from jaxslam import log as log_module
-from jaxslam.log import load_log, save_log
+from jaxslam.logs import log as log_module
+from jaxslam.logs.log import load_log, save_log
 
 
 def refused(path, message):

@@ -10,17 +10,19 @@ import pytest
 from scipy.stats import multivariate_normal, norm
 from test_association import case, greedy
 
-from jaxslam import check, looks, runner
-from jaxslam.association import CLUTTER, NEW, PADDING, associate
 from jaxslam.config import Config, default_params
-from jaxslam.descriptors import space
-from jaxslam.frames import frames
-from jaxslam.gate import concerned, nowhere
-from jaxslam.log import save_log
-from jaxslam.looks import learnt
-from jaxslam.report import errors
-from jaxslam.sensors import Measurements
-from jaxslam.simulate import planar
+from jaxslam.filter import appearance
+from jaxslam.filter.appearance import learnt
+from jaxslam.filter.association import CLUTTER, NEW, PADDING, associate
+from jaxslam.filter.candidate_slots import concerned, nowhere
+from jaxslam.filter.frames import frames
+from jaxslam.logs import diagnostics
+from jaxslam.logs.appearance_space import space
+from jaxslam.logs.log import save_log
+from jaxslam.models.sensors import Measurements
+from jaxslam.results.run_folder import errors
+from jaxslam.runs import run
+from jaxslam.simulation.planar import planar
 
 FULL = jnp.array([4, 4, 4])  # slots free for births: beyond the map
 WITHIN = 0.3  # standard deviation of a landmark's colours, whose centres' is 1
@@ -105,7 +107,7 @@ def test_columns_that_repeat_or_add_noise_change_little(room):
 
 def test_without_descriptors_or_links_there_are_no_looks(room):
     blind = with_columns(room, None)
-    assert runner.config_for(blind, "bearing").descriptors == 0
+    assert run.config_for(blind, "bearing").descriptors == 0
     few = {name: getattr(room, name)[:5] for name in ("frame", "bearing", "descriptor")}
     few = dataclasses.replace(room, **few, identity=None, truth=None)
     assert len(space(few).within) == 0
@@ -116,16 +118,16 @@ def test_without_descriptors_or_links_there_are_no_looks(room):
 
 
 def test_hidden_bearings_alone_get_looks_unless_told_otherwise(room):
-    assert runner.config_for(room, "bearing").descriptors == 2
-    assert runner.config_for(room, "bearing", descriptors=1).descriptors == 1
-    assert runner.config_for(planar(length_m=3.0)).descriptors == 0
+    assert run.config_for(room, "bearing").descriptors == 2
+    assert run.config_for(room, "bearing", descriptors=1).descriptors == 1
+    assert run.config_for(planar(length_m=3.0)).descriptors == 0
     with pytest.raises(ValueError, match="3 descriptors are asked for, but 2 tell landmarks"):
         frames(room, "bearing", descriptors=3)
     with pytest.raises(ValueError, match="identities are known, so looks decide nothing"):
         Config(association="known", descriptors=1)
     with pytest.raises(ValueError, match=r"Config\.descriptors: -1 is not a whole number"):
         Config(descriptors=-1)
-    texts = [finding.text for finding in check.check(room)]
+    texts = [finding.text for finding in diagnostics.check(room)]
     assert "descriptors of 4 columns: 2 coordinates tell landmarks apart" in texts
 
 
@@ -144,12 +146,12 @@ def test_the_gain_is_the_predictive_density_over_that_of_any_row(x64):
     rng, within = np.random.default_rng(0), np.array([0.1, 0.4])
     sightings = [rng.normal(size=(n, 2)) for n in (1, 4, 0)]
     seen = rng.normal(size=(3, 2))
-    known = looks.Looks(
+    known = appearance.Looks(
         mean=jnp.array([s.mean(0) if len(s) else [5.0, 5.0] for s in sightings]).T,
         weight=jnp.array([float(len(s)) for s in sightings]),
         birth=jnp.arange(3),
     )
-    found = looks.gain(known, measured(seen, within))
+    found = appearance.gain(known, measured(seen, within))
     for k, d in enumerate(seen):
         for m, before in enumerate(sightings):
             ratio = 0.0
@@ -163,14 +165,16 @@ def test_the_gain_is_the_predictive_density_over_that_of_any_row(x64):
                 rows = before[:, j]
                 ratio += joint(np.append(rows, d[j])) - norm.logpdf(d[j])
                 ratio -= joint(rows) if len(rows) else 0.0
-            expected = np.logaddexp(np.log(1 - looks.CHANGED) + ratio, np.log(looks.CHANGED))
+            expected = np.logaddexp(
+                np.log(1 - appearance.CHANGED) + ratio, np.log(appearance.CHANGED)
+            )
             np.testing.assert_allclose(found[k, m], expected, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found[:, 2], 0, atol=1e-9)
 
 
 def test_a_look_is_the_mean_of_its_sightings_and_ends_with_its_landmark(x64):
     config = Config(sensor="bearing", landmarks=4, descriptors=2, measurements=3)
-    known, rng = looks.empty(config, float), np.random.default_rng(1)
+    known, rng = appearance.empty(config, float), np.random.default_rng(1)
     seen = rng.normal(size=(20, 3, 2))
     for t in range(20):
         match = jnp.array([2, CLUTTER, 0 if t % 2 else 1])
@@ -180,7 +184,7 @@ def test_a_look_is_the_mean_of_its_sightings_and_ends_with_its_landmark(x64):
             np.testing.assert_allclose(known.mean[:, 2], seen[:4, 0].mean(0))
             np.testing.assert_allclose(known.mean[:, 0], seen[1:4:2, 2].mean(0))
             assert known.weight.tolist() == [2, 2, 4, 0] and known.birth.tolist() == [41, 40, 5, -1]
-    assert known.weight.tolist() == [5, 5, looks.LATEST, 0]  # not by what was not valid
+    assert known.weight.tolist() == [5, 5, appearance.LATEST, 0]  # not by what was not valid
     other = learnt(known, jnp.array([2, NEW, NEW]), jnp.array([6, NEW, NEW]), FULL, 20, frame)
     np.testing.assert_allclose(other.mean[:, 2], seen[19, 0])
     assert other.weight[2] == 1 and other.birth[2] == 6
@@ -193,11 +197,11 @@ def test_a_look_is_the_mean_of_its_sightings_and_ends_with_its_landmark(x64):
         90,
         92,
     ]
-    gone = looks.without(known, jnp.array([True, False, True, False]))
+    gone = appearance.without(known, jnp.array([True, False, True, False]))
     assert gone.weight.tolist() == [0, 5, 0, 0]
-    moved = looks.moved(known, jnp.array([5, 77, 41, 6]))
+    moved = appearance.moved(known, jnp.array([5, 77, 41, 6]))
     np.testing.assert_array_equal(moved.mean[:, [0, 2]], known.mean[:, [2, 0]])
-    assert moved.weight.tolist() == [looks.LATEST, 0, 5, 0]
+    assert moved.weight.tolist() == [appearance.LATEST, 0, 5, 0]
 
 
 @pytest.mark.parametrize("spread", [0.05, 1.5])
@@ -233,8 +237,8 @@ def test_looks_find_lines_that_bearings_alone_confuse(blurred):
     settings = dict(particles=100, landmarks=96)
     right, wrong = [], []
     for changes in (dict(descriptors=0), dict()):
-        config = runner.config_for(blurred, "bearing", **settings, **changes)
-        found = runner.run(blurred, config, seed=0, refine=False)
+        config = run.config_for(blurred, "bearing", **settings, **changes)
+        found = run.run(blurred, config, seed=0, refine=False)
         got = errors(found)
         right.append(got["association_accuracy"])
         wrong.append(got["landmarks_missed"] + got["landmarks_spurious"])

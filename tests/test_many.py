@@ -5,10 +5,11 @@ import csv
 import numpy as np
 import pytest
 
-from jaxslam import cli, many, runner
+from jaxslam.cli import main as cli
 from jaxslam.config import default_params
-from jaxslam.log import load_log
-from jaxslam.parts import cut
+from jaxslam.logs.log import load_log
+from jaxslam.logs.slicing import cut
+from jaxslam.runs import batch, run
 
 CONFIG = dict(particles=30, landmarks=30, measurements=10)  # test_offline's: compiled once
 
@@ -21,17 +22,17 @@ def woods():
 @pytest.fixture(scope="module")
 def three(woods):
     """Three tasks, worked off in programs of two, and their results."""
-    config = runner.config_for(woods, "range_bearing", **CONFIG)
-    todo = many.tasks("1,4", default_params("range_bearing", woods), ["err_rot=0.05,0.2"])[:3]
-    before, many.BYTES = many.BYTES, 2 * state_bytes(config)
+    config = run.config_for(woods, "range_bearing", **CONFIG)
+    todo = batch.tasks("1,4", default_params("range_bearing", woods), ["err_rot=0.05,0.2"])[:3]
+    before, batch.BYTES = batch.BYTES, 2 * state_bytes(config)
     try:
-        return config, todo, many.run(woods, config, todo, refine=False)
+        return config, todo, batch.run(woods, config, todo, refine=False)
     finally:
-        many.BYTES = before
+        batch.BYTES = before
 
 
 def state_bytes(config):
-    return many.capacity.of_arrays(runner.shapes(config))
+    return batch.capacity.of_arrays(run.shapes(config))
 
 
 def test_each_run_is_bit_for_bit_what_it_is_alone(woods, three):
@@ -41,7 +42,7 @@ def test_each_run_is_bit_for_bit_what_it_is_alone(woods, three):
     ]  # fmt: skip
     assert len(results) == 3
     for i in (1, 2):
-        alone = runner.run(woods, config, todo[i].params, todo[i].seed, refine=False)
+        alone = run.run(woods, config, todo[i].params, todo[i].seed, refine=False)
         for name in ("pose", "cov", "log_evidence", "ess", "match"):
             np.testing.assert_array_equal(getattr(alone, name), getattr(results[i], name))
         np.testing.assert_array_equal(alone.landmarks.mean, results[i].landmarks.mean)
@@ -52,8 +53,8 @@ def test_each_run_is_bit_for_bit_what_it_is_alone(woods, three):
 
 def test_the_table_has_a_line_for_each_run_and_its_mean_and_spread(three):
     _, todo, results = three
-    found = many.rows(todo, results)
-    lines = many.table(found).splitlines()
+    found = batch.rows(todo, results)
+    lines = batch.table(found).splitlines()
     assert [line.split()[0] for line in lines] == ["seed", "1", "4", "mean", "sd", "1"]
     evidence = [row["log_likelihood"] for row in found[:2]]
     assert float(lines[3].split()[2]) == pytest.approx(np.mean(evidence), abs=0.06)
@@ -62,20 +63,20 @@ def test_the_table_has_a_line_for_each_run_and_its_mean_and_spread(three):
 
 def test_saved_are_the_table_and_each_runs_folder(three, woods, tmp_path):
     _, todo, results = three
-    many.save(todo, results, tmp_path / "all")
+    batch.save(todo, results, tmp_path / "all")
     with open(tmp_path / "all" / "runs.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [row["err_rot"] for row in rows] == ["0.05", "0.05", "0.2"]
-    again = many.report.load(tmp_path / "all" / "seed-4-err_rot-0.05")
+    again = batch.report.load(tmp_path / "all" / "seed-4-err_rot-0.05")
     np.testing.assert_array_equal(again.pose, results[1].pose)
     with pytest.raises(ValueError, match="exists; choose another"):
-        many.save(todo, results, tmp_path / "all")
-    many.save(todo[:1], results[:1], tmp_path / "all", overwrite=True)
+        batch.save(todo, results, tmp_path / "all")
+    batch.save(todo[:1], results[:1], tmp_path / "all", overwrite=True)
     assert len(list((tmp_path / "all").iterdir())) == 2
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "file").touch()
     with pytest.raises(ValueError, match=r"holds no runs.csv"):
-        many.save(todo, results, tmp_path / "other", overwrite=True)
+        batch.save(todo, results, tmp_path / "other", overwrite=True)
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
@@ -83,13 +84,13 @@ def test_saved_are_the_table_and_each_runs_folder(three, woods, tmp_path):
     ("text", "found"), [("3", [3]), ("0-3", [0, 1, 2, 3]), ("7, 1-2,1", [7, 1, 2])]
 )
 def test_seeds(text, found):
-    assert many.numbers(text) == found
+    assert batch.numbers(text) == found
 
 
 @pytest.mark.parametrize("text", ["", "3-1", "a", "1,", "-1", "0-4294967296"])
 def test_what_are_no_seeds(text):
     with pytest.raises(ValueError, match=r"--seeds is .*must be whole numbers"):
-        many.numbers(text)
+        batch.numbers(text)
 
 
 @pytest.mark.parametrize(
@@ -104,7 +105,7 @@ def test_what_are_no_seeds(text):
 )
 def test_what_is_no_sweep(sweeps, problem):
     with pytest.raises(ValueError, match=problem):
-        many.tasks("0", default_params(), sweeps)
+        batch.tasks("0", default_params(), sweeps)
 
 
 def test_seeds_are_for_runs_without_checkpoints(capsys):

@@ -15,11 +15,14 @@ import numpy as np
 import pytest
 from test_looks import coloured
 
-from jaxslam import checkpoint, cli, lock, offline, report, runner
+from jaxslam.cli import main as cli
 from jaxslam.config import default_params
-from jaxslam.log import save_log
-from jaxslam.runner import config_for
-from jaxslam.simulate import planar
+from jaxslam.logs.log import save_log
+from jaxslam.results import run_folder, run_lock
+from jaxslam.runs import checkpoint_file, run
+from jaxslam.runs import checkpoints as offline
+from jaxslam.runs.run import config_for
+from jaxslam.simulation.planar import planar
 
 PARTICLES = 30
 RUN = "run", "log.npz", "--landmarks", 30, "--no-refine", "--particles", PARTICLES
@@ -35,7 +38,7 @@ def log():
 def there(at, log, monkeypatch):
     """A folder with the log; chunks of 7 frames."""
     save_log("log.npz", log)
-    monkeypatch.setattr(runner, "CHUNK", 7)
+    monkeypatch.setattr(run, "CHUNK", 7)
     return at
 
 
@@ -47,7 +50,7 @@ def same(a, b):
 
 def columns(result):
     """All that a run found, but for times."""
-    found = {name: getattr(result, name) for name in report.COLUMNS}
+    found = {name: getattr(result, name) for name in run_folder.COLUMNS}
     return found | {n: getattr(result, n) for n in ("landmarks", "ancestral", "lineage")}
 
 
@@ -65,13 +68,13 @@ def broken_off(log, config, folder, chunks, **given):
             raise Stop
 
     with pytest.raises(Stop), offline.Checkpoints(folder, 0, **given) as checkpoints:
-        runner.run(log, config, None, 3, progress, False, checkpoints)
+        run.run(log, config, None, 3, progress, False, checkpoints)
 
 
 def gone_on(log, config, folder, said=None):
     say = None if said is None else said.append
     with offline.Checkpoints(folder, 0, resume=True, say=say) as checkpoints:
-        return runner.run(log, config, None, 3, None, False, checkpoints)
+        return run.run(log, config, None, 3, None, False, checkpoints)
 
 
 @pytest.mark.parametrize(
@@ -85,8 +88,8 @@ def gone_on(log, config, folder, said=None):
 )
 def test_a_resumed_run_is_bit_for_bit_the_undisturbed_one(log, tmp_path, monkeypatch, settings):
     config = config_for(log, particles=30, landmarks=30, **{"sensor": None} | settings)
-    whole = columns(runner.run(log, config, None, 3, refine=False))
-    monkeypatch.setattr(runner, "CHUNK", 1)
+    whole = columns(run.run(log, config, None, 3, refine=False))
+    monkeypatch.setattr(run, "CHUNK", 1)
     folder, said = tmp_path / "run", []
     broken_off(log, config, folder, 5)
     assert len(list((folder / "checkpoints").iterdir())) == 2
@@ -94,7 +97,7 @@ def test_a_resumed_run_is_bit_for_bit_the_undisturbed_one(log, tmp_path, monkeyp
     same(columns(gone_on(log, config, folder, said)), whole)
     assert "note: goes on after step 18, from step-00000018.npz" in said
     # The end was put aside as well: nothing is filtered or compiled again.
-    monkeypatch.setattr(runner, "compiled", None)
+    monkeypatch.setattr(run, "compiled", None)
     same(columns(gone_on(log, config, folder)), whole)
 
 
@@ -103,9 +106,9 @@ def test_looks_and_particles_drawn_anew_are_gone_on_with_bit_for_bit(tmp_path, m
     log = coloured(planar("field", 5, landmarks=25, length_m=4.0, rate_hz=8.0, outlier=0.05))
     settings = dict(sensor="bearing", descriptors=1, rejuvenate=1.5)
     config = config_for(log, particles=30, landmarks=30, **settings)
-    whole = runner.run(log, config, None, 3, refine=False)
+    whole = run.run(log, config, None, 3, refine=False)
     assert whole.events is not None
-    monkeypatch.setattr(runner, "CHUNK", 7)
+    monkeypatch.setattr(run, "CHUNK", 7)
     broken_off(log, config, tmp_path / "run", 3)
     broken_off(log, config, tmp_path / "run", 3, resume=True)
     same(columns(gone_on(log, config, tmp_path / "run")), columns(whole))
@@ -113,17 +116,17 @@ def test_looks_and_particles_drawn_anew_are_gone_on_with_bit_for_bit(tmp_path, m
 
 def test_a_genealogy_that_was_given_up_stays_so(log, tmp_path, monkeypatch):
     config = config_for(log, particles=30, landmarks=30)
-    monkeypatch.setattr(runner, "CHUNK", 7)
-    monkeypatch.setattr(runner, "TREE_BYTES", 1000)
+    monkeypatch.setattr(run, "CHUNK", 7)
+    monkeypatch.setattr(run, "TREE_BYTES", 1000)
     broken_off(log, config, tmp_path / "run", 2)
     monkeypatch.undo()
     assert gone_on(log, config, tmp_path / "run").ancestral is None
 
 
 def test_a_broken_checkpoint_is_said_and_the_one_before_it_taken(log, tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "CHUNK", 7)
+    monkeypatch.setattr(run, "CHUNK", 7)
     config, folder = config_for(log, particles=30, landmarks=30), tmp_path / "run"
-    whole = columns(runner.run(log, config, None, 3, refine=False))
+    whole = columns(run.run(log, config, None, 3, refine=False))
     broken_off(log, config, folder, 2)
     _, newest = sorted((folder / "checkpoints").iterdir())
     content = newest.read_bytes()
@@ -132,7 +135,7 @@ def test_a_broken_checkpoint_is_said_and_the_one_before_it_taken(log, tmp_path, 
         said = []
         with pytest.raises(Stop), offline.Checkpoints(folder, 0, True, say=said.append) as places:
             places.begin(log, config, default_params(config.sensor, log), 3)
-            assert places.restore(runner.shapes(config)).done == 7
+            assert places.restore(run.shapes(config)).done == 7
             raise Stop
         assert sum(line.startswith("warning: a broken checkpoint is left aside: ") for line in said)
         assert newest.name in said[0]
@@ -176,7 +179,7 @@ def test_another_run_is_not_gone_on_with(there, log, call, refuse, monkeypatch):
 
 def died(call, monkeypatch, chunks=2):
     """A run in `out` that has died, by a full disk, when it was to write its next checkpoint."""
-    write, left = checkpoint.write, [chunks]
+    write, left = checkpoint_file.write, [chunks]
 
     def failing(path, about, columns):
         left[0] -= 1
@@ -188,9 +191,9 @@ def died(call, monkeypatch, chunks=2):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     fsync = os.fsync
-    monkeypatch.setattr(checkpoint, "write", failing)
+    monkeypatch.setattr(checkpoint_file, "write", failing)
     found = call(*LONG)
-    monkeypatch.setattr(checkpoint, "write", write)
+    monkeypatch.setattr(checkpoint_file, "write", write)
     monkeypatch.setattr(os, "fsync", fsync)
     return found
 
@@ -218,7 +221,7 @@ def test_a_full_disk_leaves_the_old_checkpoint_and_an_exit_code(there, call, mon
     code, out, err = call(*LONG, "--resume")
     assert code == 0
     assert "note: goes on after step 24, from step-00000024.npz" in err
-    assert set(os.listdir("out")) <= set(report.FILES)
+    assert set(os.listdir("out")) <= set(run_folder.FILES)
     assert call(*RUN, "--out", "whole")[0] == 0
     assert results("out") == results("whole")
 
@@ -235,7 +238,7 @@ def test_at_most_two_are_kept_and_none_in_the_end(there, call, monkeypatch):
     lines = [line for line in err.splitlines() if line.startswith("step ")]
     assert len(lines) == 4
     assert lines[0].startswith("step 7 of 24, ") and " steps/s, ESS " in lines[0]
-    assert set(os.listdir("out")) <= set(report.FILES)
+    assert set(os.listdir("out")) <= set(run_folder.FILES)
     # A finished run is finished, and another one does not take its place.
     code, out, err = call(*LONG, "--resume")
     assert (code, out, err) == (0, "out: is finished already; nothing to do\n", "")
@@ -244,7 +247,7 @@ def test_at_most_two_are_kept_and_none_in_the_end(there, call, monkeypatch):
         in call(*LONG, "--resume", "--seed", 1)[2]
     )
     assert call(*LONG, "--overwrite", "--seed", 1)[0] == 0
-    assert report.load("out").seed == 1
+    assert run_folder.load("out").seed == 1
 
 
 def test_with_nothing_there_it_starts_from_the_beginning(there, call, refuse):
@@ -267,14 +270,14 @@ def test_what_the_dead_left_is_cleared_away(there, call, monkeypatch):
     (there / "out" / ".results").mkdir()
     (there / "out" / ".results" / "map.png").write_text("half")
     assert call(*LONG, "--resume")[0] == 0
-    assert set(os.listdir("out")) <= set(report.FILES)
+    assert set(os.listdir("out")) <= set(run_folder.FILES)
     assert len((there / "out" / "landmarks.csv").read_text()) > 100
     # Killed after the last of the results was there, before the rest was cleared away.
     (there / "out" / "checkpoints").mkdir()
     (there / "out" / "checkpoints" / "step-00000024.npz").write_text("old")
     (there / "out" / "lock").write_text("process 1")
     assert call(*LONG, "--resume")[1].endswith("nothing to do\n")
-    assert set(os.listdir("out")) <= set(report.FILES)
+    assert set(os.listdir("out")) <= set(run_folder.FILES)
 
 
 @pytest.mark.parametrize(
@@ -349,7 +352,7 @@ def test_ctrl_c_while_refining_says_how_to_go_on(there, call, monkeypatch):
 
     refining = [word for word in LONG if word != "--no-refine"]
     with monkeypatch.context() as patch:
-        patch.setattr(runner, "refined", interrupted)
+        patch.setattr(run, "refined", interrupted)
         code, _, err = call(*refining)
     assert code == 130
     assert err.splitlines()[-1] == (
@@ -360,13 +363,13 @@ def test_ctrl_c_while_refining_says_how_to_go_on(there, call, monkeypatch):
 
 
 def test_a_lock_dies_with_its_process_and_its_file_may_be_removed(tmp_path):
-    handle = lock.take(tmp_path)
+    handle = run_lock.take(tmp_path)
     with pytest.raises(BlockingIOError, match=f"process {os.getpid()} on "):
-        lock.check(tmp_path)
+        run_lock.check(tmp_path)
     os.close(handle)
-    lock.check(tmp_path)
+    run_lock.check(tmp_path)
     assert (tmp_path / "lock").exists()
-    os.close(lock.take(tmp_path))
+    os.close(run_lock.take(tmp_path))
 
 
 @pytest.mark.slow

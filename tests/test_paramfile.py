@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxslam.config import UNITS, Params, default_params
-from jaxslam.paramfile import (
+from jaxslam.parameter_file import (
     MEANING,
     Learning,
     load_learning,

@@ -6,17 +6,17 @@ import itertools
 import numpy as np
 import pytest
 
-from jaxslam import simulate
-from jaxslam.evaluate import truth_at
-from jaxslam.log import Log, Truth, load_log, save_log
-from jaxslam.odometry import increments
-from jaxslam.parts import PER_ROW, cut, spaced, windows
+from jaxslam.logs.log import Log, Truth, load_log, save_log
+from jaxslam.logs.odometry import increments
+from jaxslam.logs.slicing import PER_ROW, cut, spaced, windows
+from jaxslam.logs.truth import truth_at
+from jaxslam.simulation import planar
 
 S, MS = 10**9, 10**6
 
 
 def drive(commands=False):
-    return simulate.planar(
+    return planar.planar(
         length_m=12.0, landmarks=12, commands=commands, mounting=(0.1, 0.0, 0.2), seed=3
     )
 

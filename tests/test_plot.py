@@ -8,14 +8,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
 from small_run import make_log, make_refined, make_result
 
-from jaxslam import plot, report
-from jaxslam.log import FloorPlan
-from jaxslam.result import MapEstimate
+from jaxslam.logs.log import FloorPlan
+from jaxslam.results import figures, run_folder
+from jaxslam.results.result import MapEstimate
 
 
 def pictures(result, folder):
     folder.mkdir(exist_ok=True)
-    return {path.name: imread(path) for path in plot.plot(result, folder)}
+    return {path.name: imread(path) for path in figures.plot(result, folder)}
 
 
 def pixels(draw, result):
@@ -32,7 +32,7 @@ def differs(draw, a, b):
 
 def test_figures_are_decodable_pictures_of_a_fair_size_and_nothing_else_is_left(tmp_path):
     found = pictures(make_result(), tmp_path / "a")
-    assert set(found) == {path.name for path in (tmp_path / "a").iterdir()} == set(plot.FIGURES)
+    assert set(found) == {path.name for path in (tmp_path / "a").iterdir()} == set(figures.FIGURES)
     for picture in found.values():
         height, width, _ = picture.shape
         assert 700 < width < 2500
@@ -43,17 +43,17 @@ def test_figures_are_decodable_pictures_of_a_fair_size_and_nothing_else_is_left(
 def test_the_same_result_draws_the_same_and_another_differs():
     result, other = make_result(), make_result(shift=0.6)
     fewer = dataclasses.replace(result, ess=result.ess / 4)
-    assert not differs(plot.draw_map, result, make_result())
-    assert differs(plot.draw_map, result, other)
-    assert differs(plot.draw_error, result, other)
-    assert differs(plot.draw_particles, result, fewer)
+    assert not differs(figures.draw_map, result, make_result())
+    assert differs(figures.draw_map, result, other)
+    assert differs(figures.draw_error, result, other)
+    assert differs(figures.draw_particles, result, fewer)
 
 
 def test_ellipses_hold_what_three_sigma_should():
     rng = np.random.default_rng(0)
     cov = np.array([[0.5, 0.3, 0.4], [2.0, -1.0, 1.0]])
     mean = np.array([[1.0, 2.0], [-5.0, 0.0]])
-    for outline, centre, (xx, xy, yy) in zip(plot.ellipses(mean, cov), mean, cov, strict=True):
+    for outline, centre, (xx, xy, yy) in zip(figures.ellipses(mean, cov), mean, cov, strict=True):
         matrix = np.array([[xx, xy], [xy, yy]])
         offset = outline - centre
         distance = np.einsum("ci,ij,cj->c", offset, np.linalg.inv(matrix), offset)
@@ -71,7 +71,7 @@ def texts(figure):
 
 
 def test_map_says_what_it_shows():
-    legend, title = texts(plot.draw_map(make_result()))
+    legend, title = texts(figures.draw_map(make_result()))
     for entry in ("true path", "filter", "dead reckoning", "filter's landmark", "true landmark"):
         assert entry in legend
     for words in (
@@ -82,11 +82,11 @@ def test_map_says_what_it_shows():
     ):
         assert words in title
     assert "5 landmarks (1 outside the picture)" in title
-    legend, title = texts(plot.draw_map(make_refined()))
+    legend, title = texts(figures.draw_map(make_refined()))
     assert {"refined", "refined landmark", r"refined 3$\sigma$"} < set(legend)
     assert "path error 0.10 m filtered, 0.05 m refined (RMSE, not aligned)" in title
     assert "5 landmarks (4 refined, 1 outside the picture)" in title
-    legend, title = texts(plot.draw_map(make_result(truth=False)))
+    legend, title = texts(figures.draw_map(make_result(truth=False)))
     assert "true path" not in legend
     assert "no true path" in title
 
@@ -94,7 +94,7 @@ def test_map_says_what_it_shows():
 def test_a_stray_landmark_or_reckoning_does_not_shrink_the_map():
     result = make_result()
     lost = dataclasses.replace(result, dead_reckoning=result.dead_reckoning * 1000)
-    axes = plot.draw_map(lost).axes[0]
+    axes = figures.draw_map(lost).axes[0]
     assert axes.get_aspect() == 1
     assert axes.get_xlim()[1] < 8
     assert axes.get_xlim()[0] < -4  # the wall is in
@@ -106,18 +106,18 @@ def test_error_is_drawn_only_where_truth_is():
     some = np.r_[0:10, 30:40]
     holed = dataclasses.replace(truth, time=truth.time[some], pose=truth.pose[some])
     result = dataclasses.replace(result, log=dataclasses.replace(result.log, truth=holed))
-    position = plot.draw_error(result).axes[0].lines[0].get_ydata()
+    position = figures.draw_error(result).axes[0].lines[0].get_ydata()
     np.testing.assert_array_equal(np.isfinite(position), np.isin(np.arange(40), some))
     np.testing.assert_allclose(position[some], 0.1)
 
 
 def test_the_band_is_three_sigma_of_the_worst_direction():
-    band = plot.draw_error(make_result()).axes[0].collections[0]
+    band = figures.draw_error(make_result()).axes[0].collections[0]
     assert band.get_paths()[0].vertices[:, 1].max() == pytest.approx(3 * np.sqrt(0.02))
 
 
 def test_every_path_has_its_error_over_time():
-    figure = plot.draw_error(make_refined())
+    figure = figures.draw_error(make_refined())
     told = texts(figure)[0]
     assert {"filter", "ancestral", "refined", "dead reckoning"} < set(told)
     assert {r"filter's own 3$\sigma$", r"refined path's own 3$\sigma$"} < set(told)
@@ -130,8 +130,8 @@ def test_every_path_has_its_error_over_time():
 
 
 def test_the_past_that_hangs_on_one_is_marked():
-    axes = plot.draw_particles(make_refined()).axes
-    assert len(axes) == len(plot.draw_particles(make_result()).axes) + 1
+    axes = figures.draw_particles(make_refined()).axes
+    assert len(axes) == len(figures.draw_particles(make_result()).axes) + 1
     curve = axes[-1].lines[0]
     np.testing.assert_allclose(curve.get_xdata(), 0.2 * np.arange(39, 0, -1))  # before the end
     np.testing.assert_array_equal(curve.get_ydata(), np.arange(39) // 10 + 1)
@@ -151,7 +151,7 @@ def shown_readings(log):
 def test_single_readings_are_drawn_as_dots():
     result = make_result()
     result = dataclasses.replace(result, log=shown_readings(result.log))
-    dots = plot.draw_error(result).axes[0].lines[1]
+    dots = figures.draw_error(result).axes[0].lines[1]
     assert dots.get_marker() == "."
     np.testing.assert_allclose(dots.get_xdata(), [0, 2, 4, 6])
 
@@ -190,16 +190,16 @@ def test_one_frame_is_drawn_too(tmp_path):
 
 
 def test_saved_runs_are_drawn_anew(tmp_path):
-    report.save(make_result(), tmp_path / "run")
+    run_folder.save(make_result(), tmp_path / "run")
     before = imread(tmp_path / "run" / "map.png")
     (tmp_path / "run" / "map.png").unlink()
-    plot.plot_folder(tmp_path / "run")
+    figures.plot_folder(tmp_path / "run")
     np.testing.assert_array_equal(imread(tmp_path / "run" / "map.png"), before)
 
 
 def test_an_unwritable_place_is_a_one_line_error(tmp_path):
     with pytest.raises(ValueError, match=r"map\.png: cannot write"):
-        plot.plot(make_result(), tmp_path / "missing")
+        figures.plot(make_result(), tmp_path / "missing")
 
 
 def test_pyplot_is_never_touched():

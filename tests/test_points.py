@@ -8,7 +8,7 @@ import pytest
 
 from calibration import sensor, sensor_report
 from calibration.points import compare, coverage, identified, point_errors, with_model
-from jaxslam.log import Log, Truth
+from jaxslam.logs.log import Log, Truth
 
 STEP, SIGMA = 0.3, math.radians(0.2)
 STAMPS = np.arange(61) * 10**9

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from test_exact import START, START_COV, problem
 
-from jaxslam import filter as fastslam
-from jaxslam import motion, proposal, sensors
-from jaxslam.association import CLUTTER, NEW
 from jaxslam.config import SENSORS, Config, default_params
-from jaxslam.odometry import Odometry
-from jaxslam.sensors import Measurements
+from jaxslam.filter import proposal
+from jaxslam.filter import step as fastslam
+from jaxslam.filter.association import CLUTTER, NEW
+from jaxslam.logs.odometry import Odometry
+from jaxslam.models import motion, sensors
+from jaxslam.models.sensors import Measurements
 
 ODOMETRY = Odometry(0.3, 0.05, 0.2, 0.32, 0.25, 0.5, 0.4, 0.1)
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from jaxslam.log import load_log, save_log
-from jaxslam.readers import read
-from jaxslam.readers.csvpair import read_csv
+from jaxslam.logs.log import load_log, save_log
+from jaxslam.logs.readers import read
+from jaxslam.logs.readers.csv_files import read_csv
 
 S = 10**9
 

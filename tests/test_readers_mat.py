@@ -7,9 +7,9 @@ import pytest
 import scipy.io
 from refusal import refused
 
-from jaxslam.log import load_log
-from jaxslam.readers import mat5, read
-from jaxslam.readers.mat import read_mat
+from jaxslam.logs.log import load_log
+from jaxslam.logs.readers import mat5, read
+from jaxslam.logs.readers.aer1513 import read_mat
 
 S = 10**9
 COURSE = Path(__file__).parents[2] / "shared" / "data" / "lost_in_the_woods" / "dataset2.mat"

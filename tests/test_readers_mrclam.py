@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from jaxslam.readers import read
+from jaxslam.logs.readers import read
 
 S = 10**9
 MRCLAM = Path(__file__).parents[2] / "shared" / "data" / "mrclam"

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import jaxslam
-from jaxslam import cli
+from jaxslam.cli import main as cli
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 

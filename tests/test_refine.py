@@ -6,13 +6,16 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from jaxslam import bundle, chain, simulate
 from jaxslam.config import default_params
-from jaxslam.evaluate import ate, pair_by_distance, wrap
-from jaxslam.frames import Frames, frames
-from jaxslam.odometry import Odometry, dead_reckoning
-from jaxslam.refine import refine
-from jaxslam.sensors import Measurements
+from jaxslam.filter.frames import Frames, frames
+from jaxslam.logs.odometry import Odometry, dead_reckoning
+from jaxslam.logs.truth import wrap
+from jaxslam.models.sensors import Measurements
+from jaxslam.results.metrics import ate, pair_by_distance
+from jaxslam.simulation import planar
+from jaxslam.smoother import least_squares as bundle
+from jaxslam.smoother import normal_equations
+from jaxslam.smoother.refine import refine
 
 WORLD = np.array([[2.0, 1.0], [0.0, -1.5], [3.5, -0.5]])
 
@@ -69,31 +72,33 @@ def test_chain_is_the_dense_solution(points):
     right = rng.normal(size=len(dense))
     blocks = dense[: 3 * poses, : 3 * poses].reshape(poses, 3, poses, 3)
     at = np.arange(poses)
-    normal = chain.Normal(
+    normal = normal_equations.Normal(
         diagonal=blocks[at, :, at],
         off=blocks[at[:-1], :, at[1:]],
-        border=chain.csr_array(dense[3 * poses :, : 3 * poses]),
+        border=normal_equations.csr_array(dense[3 * poses :, : 3 * poses]),
         corner=np.array(
             [corner[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] for i in range(points)]
         ).reshape(points, 2, 2),
         pose_gradient=right[: 3 * poses].reshape(poses, 3),
         point_gradient=right[3 * poses :].reshape(points, 2),
     )
-    pose, point, factor = chain.solve(normal)
+    pose, point, factor = normal_equations.solve(normal)
     step, cov = np.linalg.solve(dense, right), np.linalg.inv(dense)
     np.testing.assert_allclose(np.append(pose, point), step, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(factor.points, cov[3 * poses :, 3 * poses :], rtol=1e-9, atol=1e-12)
     ours = cov[: 3 * poses, : 3 * poses].reshape(poses, 3, poses, 3)[at, :, at]
-    np.testing.assert_allclose(chain.pose_covariances(factor), ours, rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(
+        normal_equations.pose_covariances(factor), ours, rtol=1e-8, atol=1e-12
+    )
 
 
 def test_chain_says_when_a_matrix_is_not_positive_definite():
-    normal = chain.Normal(
-        -np.eye(3)[None], np.zeros((0, 3, 3)), chain.csr_array((0, 3)), np.zeros((0, 2, 2)),
+    normal = normal_equations.Normal(
+        -np.eye(3)[None], np.zeros((0, 3, 3)), normal_equations.csr_array((0, 3)), np.zeros((0, 2, 2)),
         np.zeros((1, 3)), np.zeros((0, 2)),
     )  # fmt: skip
     with pytest.raises(np.linalg.LinAlgError):
-        chain.solve(normal)
+        normal_equations.solve(normal)
 
 
 def smoothed(odometry, value, start_cov, params, noise):
@@ -220,7 +225,7 @@ def test_the_world_may_be_turned():
 
 def room(sensor, known, **changes):
     """A simulated room's log, frames, parameters, true path, and a path bent by 0.3 m."""
-    log = simulate.planar(
+    log = planar.planar(
         "room", 2, length_m=40.0, rate_hz=2.5, landmarks=14, max_per_frame=6, **changes
     )
     params = default_params(sensor, log)

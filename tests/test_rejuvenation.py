@@ -7,12 +7,16 @@ import numpy as np
 import pytest
 from test_refine import births, room
 
-from jaxslam import bundle, filter, redraw, refine, rejuvenation, run, runner
+from jaxslam import run
 from jaxslam.config import Config
-from jaxslam.evaluate import errors
-from jaxslam.events import DROPPED, FAILED, FOUND, MERGED, events
-from jaxslam.odometry import Odometry
-from jaxslam.simulate import planar
+from jaxslam.filter import step
+from jaxslam.logs.odometry import Odometry
+from jaxslam.results.events import events
+from jaxslam.results.metrics import errors
+from jaxslam.runs import run as runner
+from jaxslam.simulation.planar import planar
+from jaxslam.smoother import least_squares, posterior_sampling, refine, rejuvenation
+from jaxslam.smoother.events import DROPPED, FAILED, FOUND, MERGED
 
 
 def odometry(distance):
@@ -36,7 +40,9 @@ def solved():
     log, data, params, true, _ = room("bearing", False)
     birth, _ = births(log, data)
     with jax.enable_x64(True):
-        given, place = bundle.problem(data, log.start_pose, np.eye(3) * 1e-4, params, "bearing")
+        given, place = least_squares.problem(
+            data, log.start_pose, np.eye(3) * 1e-4, params, "bearing"
+        )
         found = refine.solved(given, place, true, birth.ravel()[place], False, again=True)
     return given, found
 
@@ -48,8 +54,8 @@ def test_pose_and_points_are_those_of_the_whole_inverse(solved):
     rows, which = refine.regroup.inside(found.groups)
     size, poses = len(rows), 3 * len(fit.path)
     with jax.enable_x64(True):
-        linear = bundle._linearise(given, fit.path, fit.points, which)
-        normal = bundle._assemble(given, linear, fit.weight * given.share, which, size, 0.0)
+        linear = least_squares._linearise(given, fit.path, fit.points, which)
+        normal = least_squares._assemble(given, linear, fit.weight * given.share, which, size, 0.0)
     whole = np.zeros((poses + 2 * size,) * 2)
     for t, block in enumerate(normal.diagonal):
         whole[3 * t : 3 * t + 3, 3 * t : 3 * t + 3] = block
@@ -66,7 +72,7 @@ def test_pose_and_points_are_those_of_the_whole_inverse(solved):
     slope = -np.linalg.solve(whole[poses:, poses:], border)
     linear = np.vstack([np.eye(poses)[-3:], slope])
     expected = linear @ path @ linear.T
-    got = redraw.covariance(fit)
+    got = posterior_sampling.covariance(fit)
     assert np.abs(got - expected).max() < 1e-6 * np.abs(expected).max()
     # With what each point has of its own, the points' marginal.
     marginal = got[3:, 3:] + np.linalg.inv(whole[poses:, poses:])
@@ -77,12 +83,16 @@ def test_pose_and_points_are_those_of_the_whole_inverse(solved):
 def test_drawn_particles_have_the_moments_asked_for(sensor):
     config = Config(sensor=sensor, particles=40_000, landmarks=4, association="known")
     config = dataclasses.replace(config, forgetting=True)
-    joint, draw = redraw.nothing(4), np.random.default_rng(0)
+    joint, draw = posterior_sampling.nothing(4), np.random.default_rng(0)
     root = np.tril(0.02 * draw.normal(size=(7, 7))).astype(np.float32)
     index = np.array([0, 1, 2, 3, 4, 7, 8])  # slots 0 and 2
     joint.root[index[:, None], np.arange(7)] = root
     joint.pose[:] = 1.0, -2.0, 3.1
-    joint.kind[[0, 2, 3]] = redraw.POINT, redraw.POINT, redraw.YOUNG
+    joint.kind[[0, 2, 3]] = (
+        posterior_sampling.POINT,
+        posterior_sampling.POINT,
+        posterior_sampling.YOUNG,
+    )
     joint.mean[:, [0, 2]] = np.array([[3.0, 1.0], [-1.0, 2.0]]).T
     joint.anchor[:, [0, 2]] = np.array([[1.0, 0.5], [0.2, -1.0]]).T
     joint.factor[:, [0, 2]] = np.array([[0.03, 0.01, 0.02], [0.05, -0.02, 0.01]]).T
@@ -92,7 +102,9 @@ def test_drawn_particles_have_the_moments_asked_for(sensor):
         (0.1, 0, 0.2),
     )
     joint.count[[0, 2, 3]], joint.birth[[0, 2, 3]] = (5, 6, 7), (10, 20, 30)
-    state = redraw.drawn(jax.random.key(1), joint._replace(used=np.int32(7)), 12, config)
+    state = posterior_sampling.drawn(
+        jax.random.key(1), joint._replace(used=np.int32(7)), 12, config
+    )
     assert state.step == 12 and np.allclose(np.exp(state.log_weight).sum(), 1)
     pose, world = np.asarray(state.pose, float), jax.tree.map(np.asarray, state.landmarks)
     assert (np.abs(pose[2]) <= np.pi + 1e-6).all()
@@ -105,7 +117,7 @@ def test_drawn_particles_have_the_moments_asked_for(sensor):
         if sensor == "bearing":
             ray = np.stack([np.cos(mean[0]), np.sin(mean[0])]) / mean[1]
             mean = world.anchor[:, slot] + ray
-            _, cov, known = filter.landmarks.to_world("bearing", world)
+            _, cov, known = step.landmarks.to_world("bearing", world)
             l11, l21, l22 = joint.factor[:, slot]
             exact = l11**2, l11 * l21, l21**2 + l22**2
             assert known[slot].all()
@@ -220,9 +232,9 @@ def test_chunks_make_no_difference(log, found, monkeypatch):
 
 
 def test_it_goes_on_from_a_checkpoint_with_the_same_bits(log, found, tmp_path):
-    from jaxslam import offline
+    from jaxslam.runs import checkpoints
 
-    class Stopped(offline.Checkpoints):
+    class Stopped(checkpoints.Checkpoints):
         def reached(self, at, total, line):
             super().reached(at, total, line)
             if at.done >= total // 2:
@@ -230,7 +242,7 @@ def test_it_goes_on_from_a_checkpoint_with_the_same_bits(log, found, tmp_path):
 
     with pytest.raises(KeyboardInterrupt), Stopped(tmp_path / "run", 0.0, False, False) as kept:
         run(log, found.config, seed=1, refine=False, checkpoints=kept)
-    with offline.Checkpoints(tmp_path / "run", 0.0, True, False) as kept:
+    with checkpoints.Checkpoints(tmp_path / "run", 0.0, True, False) as kept:
         again = run(log, found.config, seed=1, refine=False, checkpoints=kept)
     same(found, again)
 

@@ -6,12 +6,19 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxslam import render
-from jaxslam.drive import Drive, stop_and_go
-from jaxslam.furnish import furnish
-from jaxslam.raycast import camera_rays, cast, expose, scene
-from jaxslam.render import PRESETS, Effects, double_mirror_camera, frames, nominal, render_room
-from jaxslam.room import eye_at, look, visible_edges
+from jaxslam.simulation.room import render
+from jaxslam.simulation.room.furniture import furnish
+from jaxslam.simulation.room.geometry import eye_at, look, visible_edges
+from jaxslam.simulation.room.raycast import camera_rays, cast, expose, scene
+from jaxslam.simulation.room.render import (
+    PRESETS,
+    Effects,
+    double_mirror_camera,
+    frames,
+    nominal,
+    render_room,
+)
+from jaxslam.simulation.room.trajectory import Drive, stop_and_go
 from jaxslam.vision.camera_files import load_camera
 
 HEADERS = {

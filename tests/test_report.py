@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from small_run import LANDMARKS, START, make_log, make_refined, make_result
 
-from jaxslam import evaluate, report
 from jaxslam.config import Config, Params
-from jaxslam.error_table import error_table
-from jaxslam.events import events as events_of
-from jaxslam.log import Truth, save_log
+from jaxslam.logs.log import Truth, save_log
+from jaxslam.results import metrics, run_folder
+from jaxslam.results.events import events as events_of
+from jaxslam.results.tables import error_table
 
 NAME = "lost-in-the-woods"
 HEAD = ["aligned", "RMSE", "unaligned", "RMSE", "unaligned", "max", "at", "the", "end"]
@@ -33,20 +33,20 @@ def same(a, b):
 @pytest.mark.parametrize("make", [make_result, make_refined])
 def test_what_is_saved_is_loaded_again(tmp_path, make):
     result = make()
-    report.save(result, tmp_path / "run", figures=False)
-    loaded = report.load(tmp_path / "run")
+    run_folder.save(result, tmp_path / "run", figures=False)
+    loaded = run_folder.load(tmp_path / "run")
     for item in dataclasses.fields(result):
         if item.name not in ("log", "params"):
             assert same(getattr(loaded, item.name), getattr(result, item.name)), item.name
     assert loaded.params == tuple(map(float, result.params))
-    assert report.evaluate_folder(tmp_path / "run") == evaluate.errors(result)
+    assert run_folder.evaluate_folder(tmp_path / "run") == metrics.errors(result)
 
 
 def test_what_was_refined_has_files_of_its_own(tmp_path):
-    report.save(make_result(), tmp_path / "run", figures=False)
+    run_folder.save(make_result(), tmp_path / "run", figures=False)
     before = contents(tmp_path / "run")
     assert not [name for name in before if "refined" in name]
-    report.save(make_refined(), tmp_path / "run", overwrite=True, figures=False)
+    run_folder.save(make_refined(), tmp_path / "run", overwrite=True, figures=False)
     after = contents(tmp_path / "run")
     assert set(after) - set(before) == {"trajectory_refined.tum", "landmarks_refined.csv"}
     for name in ("trajectory.tum", "landmarks.csv", "events.jsonl"):
@@ -59,12 +59,12 @@ def test_what_was_refined_has_files_of_its_own(tmp_path):
     table = np.loadtxt(lines[1:], delimiter=",")
     np.testing.assert_array_equal(table[:, 1:3], result.refined.mean)
     np.testing.assert_array_equal(table[:, 3:6], result.refined.landmark_cov)
-    report.save(make_result(), tmp_path / "run", overwrite=True, figures=False)
+    run_folder.save(make_result(), tmp_path / "run", overwrite=True, figures=False)
     assert not [name for name in contents(tmp_path / "run") if "refined" in name]
 
 
 def test_summary_of_what_looks_back():
-    plain, summary = report.summarise(make_result()), report.summarise(make_refined())
+    plain, summary = run_folder.summarise(make_result()), run_folder.summarise(make_refined())
     told = dict(refine_seconds=0.75, refine_rounds=3, refine_converged=True, least_ancestors=1)
     told |= dict(n_landmarks_refined=4, n_landmarks=5)
     assert summary | told == summary
@@ -80,29 +80,29 @@ def test_run_toml_resolves_everything(tmp_path):
     source = tmp_path / 'a "log" \\ here.npz'
     save_log(source, make_log())
     result = dataclasses.replace(make_result(), seed=np.int64(7))
-    report.save(result, tmp_path / "run", log_source=source, figures=False)
+    run_folder.save(result, tmp_path / "run", log_source=source, figures=False)
     told = tomllib.loads((tmp_path / "run" / "run.toml").read_text(encoding="utf-8"))
     assert Config(**told["config"]) == result.config
     assert set(told["config"]) == {item.name for item in dataclasses.fields(Config)}
     assert Params(**told["params"]) == tuple(map(float, result.params))
     assert (told["seed"], told["log"], told["name"]) == (7, str(source), "circle")
     assert not (tmp_path / "run" / "log.npz").exists()
-    assert report.load(tmp_path / "run").log.name == "circle"
+    assert run_folder.load(tmp_path / "run").log.name == "circle"
 
 
 def test_a_bundled_log_is_told_by_name(tmp_path):
-    report.save(make_result(), tmp_path / "run", log_source=NAME, figures=False)
+    run_folder.save(make_result(), tmp_path / "run", log_source=NAME, figures=False)
     told = tomllib.loads((tmp_path / "run" / "run.toml").read_text(encoding="utf-8"))
     assert told["log"] == NAME
     with pytest.raises(ValueError, match="not the log of this run"):
-        report.load(tmp_path / "run")
+        run_folder.load(tmp_path / "run")
 
 
 def test_trajectory_keeps_every_nanosecond_and_uses_plain_decimals():
     rng = np.random.default_rng(0)
     time = np.array([START, START + 1, 5, 0, -1, -1_500_000_000, 4_000_000_000_000_000_123])
     pose = rng.normal(size=(7, 3)) * [1e-9, 1e6, 1]
-    lines = list(report.tum_lines(time, pose))
+    lines = list(run_folder.tum_lines(time, pose))
     assert lines[0].startswith("1700000000.123456789 ")
     assert [line.split()[0] for line in lines[3:6]] == [
         "0.000000000",
@@ -116,12 +116,12 @@ def test_trajectory_keeps_every_nanosecond_and_uses_plain_decimals():
         np.testing.assert_allclose([float(px), float(py)], [x, y], atol=1e-9)
         assert float(pz) == float(qx) == float(qy) == 0
         turned = 2 * np.arctan2(float(qz), float(qw))
-        assert evaluate.wrap(turned - heading) == pytest.approx(0, abs=1e-8)
+        assert metrics.wrap(turned - heading) == pytest.approx(0, abs=1e-8)
 
 
 def test_landmarks_are_written_to_the_last_digit(tmp_path):
     result = make_result(shift=0.1 + 1e-15)
-    report.save(result, tmp_path / "run", figures=False)
+    run_folder.save(result, tmp_path / "run", figures=False)
     text = (tmp_path / "run" / "landmarks.csv").read_text()
     assert text.splitlines()[0] == "id,x,y,sxx,sxy,syy,n"
     table = np.loadtxt(text.splitlines()[1:], delimiter=",")
@@ -133,7 +133,7 @@ def test_landmarks_are_written_to_the_last_digit(tmp_path):
 
 def test_summary_has_the_stable_keys_and_the_errors(tmp_path):
     result = make_result()
-    report.save(result, tmp_path / "run", figures=False)
+    run_folder.save(result, tmp_path / "run", figures=False)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     told = dict(n_particles=100, n_steps=40, n_measurements=80, seconds=1.25, compile_seconds=0.5)
     told |= dict(log_likelihood=-60.0, n_landmarks=5, min_ess=43.0, overflow=0)
@@ -141,13 +141,13 @@ def test_summary_has_the_stable_keys_and_the_errors(tmp_path):
     told |= dict(proposal="prior", seed=7)
     assert summary | told == summary
     assert set(summary["versions"]) == {"jaxslam", "jax", "numpy", "python"}
-    assert summary | evaluate.errors(result) == summary
+    assert summary | metrics.errors(result) == summary
     assert any("measurement slot" in line for line in summary["warnings"])
 
 
 def test_numbers_json_lacks_become_null(tmp_path):
     result = dataclasses.replace(make_result(), log_evidence=np.full(40, -np.inf))
-    report.save(result, tmp_path / "run", figures=False)
+    run_folder.save(result, tmp_path / "run", figures=False)
     text = (tmp_path / "run" / "summary.json").read_text()
     assert json.loads(text, parse_constant=pytest.fail)["log_likelihood"] is None
 
@@ -166,13 +166,13 @@ def test_events_tell_what_happened_and_when():
 
 
 def test_an_existing_folder_is_kept_without_overwrite(tmp_path):
-    report.save(make_result(), tmp_path / "run", figures=False)
+    run_folder.save(make_result(), tmp_path / "run", figures=False)
     before = contents(tmp_path / "run")
     with pytest.raises(ValueError, match="--overwrite"):
-        report.save(make_result(shift=0.5), tmp_path / "run", figures=False)
+        run_folder.save(make_result(shift=0.5), tmp_path / "run", figures=False)
     assert contents(tmp_path / "run") == before
-    report.save(make_result(shift=0.5), tmp_path / "run", overwrite=True, figures=False)
-    assert report.evaluate_folder(tmp_path / "run")["ate_filtered_unaligned_rmse_m"] > 0.4
+    run_folder.save(make_result(shift=0.5), tmp_path / "run", overwrite=True, figures=False)
+    assert run_folder.evaluate_folder(tmp_path / "run")["ate_filtered_unaligned_rmse_m"] > 0.4
     assert os.listdir(tmp_path) == ["run"]
 
 
@@ -180,19 +180,19 @@ def test_an_existing_folder_is_kept_without_overwrite(tmp_path):
 def test_overwrite_never_deletes_what_is_not_a_runs(tmp_path, kept):
     folder = (tmp_path / kept).parent
     if kept.startswith("run"):
-        report.save(make_result(), folder, figures=False)
+        run_folder.save(make_result(), folder, figures=False)
     (tmp_path / kept).write_text("years of work")
     with pytest.raises(ValueError, match="not overwritten"):
-        report.save(make_result(), folder, overwrite=True, figures=False)
+        run_folder.save(make_result(), folder, overwrite=True, figures=False)
     assert (tmp_path / kept).read_text() == "years of work"
 
 
 def test_a_file_in_the_way_is_said(tmp_path):
     (tmp_path / "run").write_text("")
     with pytest.raises(ValueError, match="run: is not a folder"):
-        report.save(make_result(), tmp_path / "run", overwrite=True)
+        run_folder.save(make_result(), tmp_path / "run", overwrite=True)
     with pytest.raises(ValueError, match=r"can't be made in .*choose another"):
-        report.save(make_result(), tmp_path / "run" / "deeper")
+        run_folder.save(make_result(), tmp_path / "run" / "deeper")
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -201,7 +201,7 @@ def test_a_failed_save_leaves_nothing_new_and_loses_nothing_old(
     tmp_path, monkeypatch, step, overwrite
 ):
     if overwrite:
-        report.save(make_result(), tmp_path / "run", figures=False)
+        run_folder.save(make_result(), tmp_path / "run", figures=False)
     before = contents(tmp_path / "run") if overwrite else None
     owner = np if step == "savez_compressed" else os
     real, calls = getattr(owner, step), []
@@ -215,7 +215,7 @@ def test_a_failed_save_leaves_nothing_new_and_loses_nothing_old(
 
     monkeypatch.setattr(owner, step, fail)
     with pytest.raises(ValueError, match="can't be written"):
-        report.save(
+        run_folder.save(
             make_result(),
             tmp_path / "run",
             overwrite=overwrite,
@@ -236,23 +236,25 @@ def test_no_space_and_interruption_clean_up_and_keep_their_kind(tmp_path, monkey
 
         monkeypatch.setattr(os, "fsync", fail)
         with pytest.raises(type(error)):
-            report.save(make_result(), tmp_path / "run", log_source=NAME, figures=False)
+            run_folder.save(make_result(), tmp_path / "run", log_source=NAME, figures=False)
         monkeypatch.undo()
         assert os.listdir(tmp_path) == []
 
 
 def test_a_rerun_over_its_own_stored_log_keeps_the_log(tmp_path):
     folder = tmp_path / "run"
-    report.save(make_result(), folder, figures=False)
-    report.save(make_result(), folder, overwrite=True, log_source=folder / "log.npz", figures=False)
+    run_folder.save(make_result(), folder, figures=False)
+    run_folder.save(
+        make_result(), folder, overwrite=True, log_source=folder / "log.npz", figures=False
+    )
     shutil.move(folder, tmp_path / "elsewhere")
-    assert report.load(tmp_path / "elsewhere").log.name == "circle"
+    assert run_folder.load(tmp_path / "elsewhere").log.name == "circle"
 
 
 def test_broken_folders_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"nowhere: no run\.toml"):
-        report.load(tmp_path / "nowhere")
-    report.save(make_result(), tmp_path / "run", figures=False)
+        run_folder.load(tmp_path / "nowhere")
+    run_folder.save(make_result(), tmp_path / "run", figures=False)
     for name, text in (
         ("steps.npz", b"PK\x03\x04"),
         ("summary.json", b"{}"),
@@ -262,20 +264,20 @@ def test_broken_folders_are_named(tmp_path):
         kept = (tmp_path / "run" / name).read_bytes()
         (tmp_path / "run" / name).write_bytes(text)
         with pytest.raises(ValueError, match="a broken run's folder"):
-            report.load(tmp_path / "run")
+            run_folder.load(tmp_path / "run")
         (tmp_path / "run" / name).write_bytes(kept)
     (tmp_path / "run" / "log.npz").unlink()
     with pytest.raises(ValueError, match="--log PATH"):
-        report.load(tmp_path / "run")
+        run_folder.load(tmp_path / "run")
     save_log(tmp_path / "moved.npz", make_log())
-    assert report.load(tmp_path / "run", tmp_path / "moved.npz").seed == 7
+    assert run_folder.load(tmp_path / "run", tmp_path / "moved.npz").seed == 7
     save_log(tmp_path / "other.npz", make_log(frames=20))
     with pytest.raises(ValueError, match="not the log of this run"):
-        report.load(tmp_path / "run", tmp_path / "other.npz")
+        run_folder.load(tmp_path / "run", tmp_path / "other.npz")
 
 
 def test_error_table_puts_dead_reckoning_beside_the_filter():
-    found = evaluate.errors(make_result())
+    found = metrics.errors(make_result())
     lines = error_table(found).splitlines()
     assert lines[0].split() == HEAD
     assert lines[1].split() == ["path,", "filter", "0.000", "m", *["0.100", "m"] * 3]
@@ -284,14 +286,14 @@ def test_error_table_puts_dead_reckoning_beside_the_filter():
     assert "4 matched, 0 missed, 1 spurious (gate 0.50 m)" in error_table(found)
     assert "refined" not in error_table(found) and "ancestral" not in error_table(found)
     only_map = dataclasses.replace(make_log(), truth=Truth(landmarks=LANDMARKS))
-    table = error_table(evaluate.errors(make_result(), only_map))
+    table = error_table(metrics.errors(make_result(), only_map))
     assert "path" not in table
     assert "0.100 m" in table
     assert "no truth" in error_table({})
 
 
 def test_error_table_shows_every_path_and_both_maps():
-    lines = error_table(evaluate.errors(make_refined())).splitlines()
+    lines = error_table(metrics.errors(make_refined())).splitlines()
     labels = [line[:24].strip() for line in lines[1:5]]
     assert labels == [f"path, {n}" for n in ("filter", "ancestral", "refined", "dead reckoning")]
     assert [line.split()[-2] for line in lines[1:4]] == ["0.100", "0.080", "0.050"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam.config import Config
-from jaxslam.resampling import gather, systematic
+from jaxslam.filter.resampling import gather, systematic
 
 
 def test_known_weights_give_known_ancestors():

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from jaxslam.drive import RADIUS, stop_and_go
-from jaxslam.furnish import furnish
-from jaxslam.room import HEIGHT, VIEW, eye_at, look, visible_edges
+from jaxslam.simulation.room.furniture import furnish
+from jaxslam.simulation.room.geometry import HEIGHT, VIEW, eye_at, look, visible_edges
+from jaxslam.simulation.room.trajectory import RADIUS, stop_and_go
 
 POSITION = (0.05, -0.02, 0.6)
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxslam.furnish import furnish
-from jaxslam.result import MapEstimate
+from jaxslam.results.result import MapEstimate
+from jaxslam.simulation.room.furniture import furnish
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 import room

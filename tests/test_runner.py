@@ -8,12 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import births, outcome, runner
-from jaxslam import filter as fastslam
 from jaxslam.config import Config, default_params
-from jaxslam.evaluate import ate
-from jaxslam.runner import config_for, refined
-from jaxslam.simulate import planar
+from jaxslam.filter import new_landmarks
+from jaxslam.filter import step as fastslam
+from jaxslam.results.metrics import ate
+from jaxslam.runs import assemble
+from jaxslam.runs import run as runner
+from jaxslam.runs.run import config_for, refined
+from jaxslam.simulation.planar import planar
 
 SIZES = dict(particles=30, landmarks=30, measurements=10)  # test_offline's: compiled once
 
@@ -91,13 +93,13 @@ def test_landmarks_without_a_depth_stay_out_of_the_map():
     state = fastslam.init(config, jax.random.key(0))
     depth, sd = jnp.array([0.5, 0.5, 0.5]), jnp.array([0.01, 0.25, 0.01])
     given = jnp.stack([jnp.zeros(3), depth]), jnp.stack([jnp.full(3, 0.01), jnp.zeros(3), sd])
-    world = births.given(state.landmarks, (*given, jnp.ones((2, 3))))
+    world = new_landmarks.given(state.landmarks, (*given, jnp.ones((2, 3))))
     # The third slot is empty.
     world = world._replace(
         count=world.count.at[2].set(0), birth=jnp.array([[7, 7], [8, 8], [9, 9]], jnp.int32)
     )
     params = default_params("bearing")
-    found = outcome._map(
+    found = assemble._map(
         state._replace(landmarks=world), 0, params, config, np.empty(0, int), np.array([5.0, 0, 0])
     )
     np.testing.assert_array_equal(found.id, [7])

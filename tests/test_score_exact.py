@@ -15,10 +15,11 @@ import pytest
 import test_exact
 from test_proposal import enumerated
 
-from jaxslam import association, likelihood
 from jaxslam.config import Config, default_params
-from jaxslam.odometry import Odometry
-from jaxslam.sensors import Measurements
+from jaxslam.filter import association
+from jaxslam.learning import likelihood
+from jaxslam.logs.odometry import Odometry
+from jaxslam.models.sensors import Measurements
 
 NAMES = ("err_tran", "floor_tran", "gain_tran", "position_scale", "outlier", "density_new")
 START, START_COV = np.array([0.3, -0.2, 0.4]), np.diag([0.02, 0.03, 0.0])

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import baseline, geometry, sensors
 from jaxslam.config import SENSORS, Config, default_params
+from jaxslam.models import geometry, sensors
+from jaxslam.reference import fastslam
 
 PARAMS = default_params()._replace(mount_x=0.2, mount_y=-0.1, mount_yaw=0.3, growth=0.02)
 COV = (0.04, 0.01, 0.02)
@@ -182,6 +183,6 @@ def test_correlated_noise_is_the_baselines(x64, distance):
     params = PARAMS._replace(correlation=0.4)
     moved = SimpleNamespace(distance=distance, turn=distance / 2)
     noisy = sensors.correlated(params, moved)
-    model = baseline.dulled(baseline.make_model(params, Config()), moved)
+    model = fastslam.dulled(fastslam.make_model(params, Config()), moved)
     for name in ("sigma_range", "sigma_bearing", "growth", "position_scale"):
         assert getattr(model, name) == pytest.approx(float(getattr(noisy, name)), rel=1e-9)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxslam import motion, simulate
-from jaxslam.simulate import planar
+from jaxslam.models import motion
+from jaxslam.simulation import planar as simulate
+from jaxslam.simulation.planar import planar
 
 TAIL = 1e-4
 EXACT = dict(err_tran=0.0, err_rot=0.0, err_drift=0.0, floor_tran=0.0, floor_rot=0.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxslam.smoothing import Tree, ancestral, lineage
+from jaxslam.smoother.genealogy import Tree, ancestral, lineage
 
 N, K = 40, 3
 

@@ -15,7 +15,8 @@ import spacing
 import spacing_rivals as rivals
 import spacing_world as world
 
-from jaxslam import default_params, evaluate
+from jaxslam import default_params
+from jaxslam.results import metrics
 
 
 @pytest.mark.parametrize("apart", world.SPACINGS)
@@ -75,8 +76,8 @@ def test_with_known_identities_the_ekf_is_exact_and_knows_how_exact():
     for seed in range(3):
         log = world.room(seed, 1.0, 1, 20.0)
         found = rivals.run(log, default_params("bearing", log), "known")
-        true = evaluate.truth_at(log.truth, log.frame_time)
-        squares.append(np.mean(evaluate.nees(found.pose, found.cov, true)))
+        true = metrics.truth_at(log.truth, log.frame_time)
+        squares.append(np.mean(metrics.nees(found.pose, found.cov, true)))
         told = spacing.measures(log, found.pose, found.row, found.match, found.mean, found.identity)
         assert min(told["right"], told["one_to_one"]) > 0.95  # not 1: points are dropped, too
         assert (told["matched"], told["spurious"]) == (world.LINES, 0)
@@ -85,7 +86,7 @@ def test_with_known_identities_the_ekf_is_exact_and_knows_how_exact():
     assert np.max(errors) < 0.1
     lost = found.pose.copy()
     lost[:, 0] += np.linspace(0, 1, len(lost)) ** 2  # the test can tell a filter that went astray
-    assert np.mean(evaluate.nees(lost, found.cov, true)) > 50
+    assert np.mean(metrics.nees(lost, found.cov, true)) > 50
 
 
 def brute(off, within, order):

@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jaxslam import motion, simulate
-from jaxslam.compare import select
 from jaxslam.config import default_params
-from jaxslam.log import Log, Truth, load_log, save_log
-from jaxslam.odometry import Odometry, increments, moments
-from jaxslam.vision.points import PointSettings, triangulate_log
+from jaxslam.logs.log import Log, Truth, load_log, save_log
+from jaxslam.logs.odometry import Odometry, increments, moments
+from jaxslam.models import motion
+from jaxslam.reference.compare import select
+from jaxslam.simulation import planar
+from jaxslam.vision.log_triangulation import PointSettings, triangulate_log
 from jaxslam.vision.triangulation import (
     BEHIND,
     FAR,
@@ -180,7 +181,7 @@ def drive(**changes):
     values = {"commands": True, "stop_m": 0.2, "length_m": 20.0, "sigma_bearing": 1e-3, "seed": 4}
     values |= {"err_tran": 0.005, "err_rot": 0.01, "err_drift": 0.01, "outlier": 0.0}
     values |= {"view": (-np.pi, np.pi, 12.0), "max_per_frame": None, "landmarks": 20}
-    log = simulate.planar(**(values | changes))
+    log = planar.planar(**(values | changes))
     return replace(log, range=None)
 
 

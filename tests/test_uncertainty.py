@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from jaxslam import learn, scale, uncertainty
 from jaxslam.config import Config, default_params
+from jaxslam.learning import fit as learn
+from jaxslam.learning import transforms, uncertainty
 
 INFORMATION = np.array([[40.0, 10.0], [10.0, 20.0]])
 
@@ -91,7 +92,7 @@ def test_what_nothing_is_known_of_stays_finite():
 def test_the_step_after_a_fit_is_taken_on_the_free_scale():
     params = default_params()._replace(err_rot=0.1, mount_yaw=0.0)
     names, none = ("err_rot", "mount_yaw"), np.empty(0)
-    free = scale.taken(params, names)
+    free = transforms.taken(params, names)
     fit = learn.Fit(
         names, params, params, free, learn.History(*[none] * 8), "done", Config(), 0, 1, 0.0
     )
@@ -102,5 +103,5 @@ def test_the_step_after_a_fit_is_taken_on_the_free_scale():
     )  # fmt: skip
     found = uncertainty.improved(fit, errors).params
     assert found.err_rot == pytest.approx(0.2)
-    assert found.mount_yaw == pytest.approx(0.5 * scale.SCALE["mount_yaw"])
+    assert found.mount_yaw == pytest.approx(0.5 * transforms.SCALE["mount_yaw"])
     assert found.err_drift == params.err_drift

@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxslam import cli, learn
+from jaxslam.cli import main as cli
 from jaxslam.config import default_params
-from jaxslam.log import load_log
-from jaxslam.paramfile import load_learning, load_params
-from jaxslam.runner import config_for
+from jaxslam.learning import fit as learn
+from jaxslam.logs.log import load_log
+from jaxslam.parameter_file import load_learning, load_params
+from jaxslam.runs.run import config_for
 from jaxslam.vision.camera_files import load_camera
 
 FIXTURES = Path(__file__).parent / "fixtures"
@@ -69,9 +70,9 @@ def test_a_run_folder(old, call):
 
 
 def test_a_checkpoint_of_a_run(old, expected, monkeypatch, capsys):
-    from jaxslam import runner
+    from jaxslam.runs import run
 
-    monkeypatch.setattr(runner, "CHUNK", 7)
+    monkeypatch.setattr(run, "CHUNK", 7)
     words = f"run log.npz {RUN} --no-refine --out interrupted --resume"
     assert cli.main(words.split()) == 0
     assert "goes on after step 22" in capsys.readouterr().err

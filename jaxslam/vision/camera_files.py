@@ -9,9 +9,9 @@ import tomllib
 from dataclasses import fields
 from pathlib import Path
 
-from jaxslam.atomic import replacing
+from jaxslam.files import replacing
 from jaxslam.vision.camera import MODELS, Camera, parameter_names
-from jaxslam.vision.camera_formats import (
+from jaxslam.vision.foreign_camera_formats import (
     from_kalibr,
     from_ocamcalib,
     from_opencv,

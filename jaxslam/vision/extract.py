@@ -10,16 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxslam.log import NOT_USED, FloorPlan, Log, save_log
-from jaxslam.odometry import increments
-from jaxslam.readers.csvpair import read_odometry, read_truth
-from jaxslam.readers.table import parse, pose_at, read_lines, settle
+from jaxslam.logs.log import NOT_USED, FloorPlan, Log, save_log
+from jaxslam.logs.odometry import increments
+from jaxslam.logs.readers.csv_files import read_odometry, read_truth
+from jaxslam.logs.readers.text_table import parse, pose_at, read_lines, settle
+from jaxslam.vision.extraction_journal import Partial
+from jaxslam.vision.image_times import NO_TIME, image_times
 from jaxslam.vision.images import Images, cv2
 from jaxslam.vision.lines import Lines, LineSettings, extract_lines, is_dark
+from jaxslam.vision.log_triangulation import triangulate_log
 from jaxslam.vision.overlay import draw_on_image
-from jaxslam.vision.partial import Partial
-from jaxslam.vision.points import triangulate_log
-from jaxslam.vision.times import NO_TIME, image_times
 
 DETECTION = 0.5  # declared: what stands in a room hides what is behind it, half of the time
 REACH = 10.0  # m, declared as what the camera can see

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from jaxslam.vision.edge_fit import fit_segments, mean
+from jaxslam.vision.edge_localisation import fit_segments, mean
 from jaxslam.vision.edges import PAD, find_edges
 from jaxslam.vision.images import check_size
-from jaxslam.vision.line_pairs import merged, separated
+from jaxslam.vision.line_merging import merged, separated
 from jaxslam.vision.panorama import panorama, unwrap
 
 BESIDE = (2, 3, 4)  # columns away from the edge whose mean is the colour beside it

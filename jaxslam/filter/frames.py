@@ -1,0 +1,145 @@
+"""From a log to what the filter eats: one odometry increment and one padded row per frame."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.config import default_params
+from jaxslam.logs.appearance_space import space
+from jaxslam.logs.odometry import Odometry, increments
+from jaxslam.models.sensors import Measurements
+
+
+class Frames(NamedTuple):
+    """T frames in K slots each: `time` int64 [T] ns, `odometry` of the interval that ends there,
+    `measurements`, log identities of the dense ones [I], each slot's row in the log [T, K] (-1:
+    padding), and how many rows were dropped, by reason."""
+
+    time: np.ndarray
+    odometry: Odometry
+    measurements: Measurements
+    identities: np.ndarray
+    row: np.ndarray
+    dropped: dict[str, int]
+
+
+def frames(log, sensor, measurements=None, params=None, known=False, descriptors=0):
+    """`Frames` of a log for one sensor.
+
+    `measurements`: slots per frame (None: as many as the fullest frame needs); beyond them the
+    farthest are dropped, or the last where there is no range. `params` gives the noise when
+    positions are made of ranges and bearings. `known`: hand over the measured identities; otherwise
+    they are hidden. `descriptors`: coordinates of their looks handed over. Raises
+    `ValueError` when the log can't supply what is asked.
+    """
+    if not log.has(sensor):
+        has = [name for name in ("position", "range_bearing", "bearing") if log.has(name)]
+        raise ValueError(
+            f"{log.name}: sensor {sensor!r} is not in this log; it has {' '.join(has)}"
+        )
+    value, cov, reach = _values(log, sensor, params)
+    # A bearing without a point is no position; nothing of it is lost, so nothing is counted.
+    rows = np.flatnonzero(np.isfinite(value).all(axis=1))
+    dropped = {}
+    identity, identities = np.full(len(log.frame), -1), np.empty(0, np.int64)
+    if known:
+        rows = _identified(log, rows, dropped)
+        identities, identity[rows] = np.unique(log.identity[rows], return_inverse=True)
+    rows, slot, slots = _slots(log, rows, reach, measurements, dropped)
+    row = np.full((len(log.frame_time), slots), -1)
+    row[log.frame[rows], slot] = rows
+    # Padding, row -1, reads the last row, which is appended here.
+    return Frames(
+        time=log.frame_time,
+        odometry=increments(log),
+        measurements=Measurements(
+            value=np.vstack([value, np.zeros((1, 2))])[row],
+            cov=np.vstack([cov, np.zeros((1, 3))])[row],
+            scale=_scale(log, sensor, row),
+            identity=np.append(identity, -1)[row].astype(np.int32),
+            valid=row >= 0,
+            active=np.ones(len(row), bool),
+            **_looks(log, descriptors, row),
+        ),
+        identities=identities,
+        row=row,
+        dropped=dropped,
+    )
+
+
+def _values(log, sensor, params):
+    """Values [n, 2], covariances [n, 3] (xx, xy, yy) and distances (None: unknown) of all rows."""
+    cov = np.zeros((len(log.frame), 3))
+    if sensor == "bearing":
+        return np.column_stack([log.bearing, np.zeros(len(log.frame))]), cov, None
+    if sensor == "range_bearing":
+        return np.column_stack([log.range, log.bearing]), cov, log.range
+    if log.has_points():
+        return log.point, log.point_cov, np.hypot(*log.point.T)
+    params = default_params(sensor, log) if params is None else params
+    r, c, s = log.range, np.cos(log.bearing), np.sin(log.bearing)
+    along = params.sigma_range**2
+    across = r**2 * (params.sigma_bearing**2 + (params.growth / r) ** 2)
+    xy = c * s * (along - across)
+    cov = np.column_stack([c**2 * along + s**2 * across, xy, s**2 * along + c**2 * across])
+    return np.column_stack([r * c, r * s]), cov, r
+
+
+def _looks(log, size, row):
+    """`Measurements.descriptor` [T, K, J] and `within` [T, J] of the slots' rows."""
+    if not size:
+        return {}
+    found = space(log)
+    if len(found.within) < size:
+        raise ValueError(
+            f"{log.name}: {size} descriptors are asked for, but {len(found.within)} tell landmarks "
+            "apart in this log (of a part of a log: make its own config, or take 0)"
+        )
+    coordinates = np.vstack([found.coordinates[:, :size], np.zeros((1, size))])
+    return dict(descriptor=coordinates[row], within=np.tile(found.within[:size], (len(row), 1)))
+
+
+def _scale(log, sensor, row):
+    """`Measurements.scale` of the slots' rows [T, K]; None where no size rests on odometry."""
+    if sensor != "position" or not log.has_points() or log.point_baseline is None:
+        return None
+    return np.append(np.isfinite(log.point_baseline), False)[row].astype(float)
+
+
+def _identified(log, rows, dropped):
+    """Those of the rows that carry an identity, the first of each identity in a frame."""
+    if log.identity is None or (len(log.identity) and (log.identity < 0).all()):
+        raise ValueError(f"{log.name}: association 'known' needs identities; this log has none")
+    _count(dropped, "no identity", int((log.identity[rows] < 0).sum()))
+    rows = rows[log.identity[rows] >= 0]
+    pairs = np.column_stack([log.frame[rows], log.identity[rows]])
+    first = np.sort(np.unique(pairs, axis=0, return_index=True)[1]) if len(rows) else rows
+    _count(dropped, "duplicate identity", len(rows) - len(first))
+    return rows[first]
+
+
+def _slots(log, rows, reach, slots, dropped):
+    """The rows that find a slot, in the log's order, their slots, and the number of slots."""
+    if slots is None:
+        slots = max(1, np.bincount(log.frame[rows], minlength=1).max())
+    rank = _rank(log.frame[rows]) if reach is None else _rank(log.frame[rows], reach[rows])
+    keep = rank < slots
+    _count(dropped, "no measurement slot", int((~keep).sum()))
+    rows = rows[keep]
+    return rows, _rank(log.frame[rows]), int(slots)
+
+
+def _rank(frame, order=None):
+    """Place of every row among those of its frame, by `order` or as they come; frames sorted."""
+    first = np.searchsorted(frame, frame)
+    place = np.arange(len(frame)) - first
+    if order is None:
+        return place
+    rank = np.empty_like(place)
+    rank[np.lexsort((order, frame))] = place
+    return rank
+
+
+def _count(dropped, reason, count):
+    if count:
+        dropped[reason] = int(count)

@@ -1,0 +1,304 @@
+"""The map of a particle: score measurements, update, forget.
+
+Arrays carry the particles last ([2, M, N] and so on, M slots): rows of many particles are
+contiguous, and every function below works on all of them at once.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.filter import sharding
+from jaxslam.filter.xla import added, pinned
+from jaxslam.models import geometry, sensors
+from jaxslam.models.geometry import wrap
+
+NODES, BETWEEN = 5, 0.75  # normals a bearing landmark is split into; share of variance between
+_node, _weight = np.polynomial.hermite_e.hermegauss(NODES)
+SPLIT = BETWEEN**0.5 * _node, np.log(_weight / _weight.sum())
+
+
+class Landmarks(NamedTuple):
+    """M landmark slots of N particles. A slot is occupied while its `count` is positive.
+
+    `mean` [2, M, N], `factor` [3, M, N]: lower factor (l11, l21, l22), `anchor` [2, M, N] or None
+    (see `sensors`), `log_odds` [M, N] of existence or None, `count` [M, N]: times seen,
+    `birth` [M, N]: frame * K + k of the measurement that created it.
+    """
+
+    mean: jax.Array
+    factor: jax.Array
+    anchor: jax.Array | None
+    log_odds: jax.Array | None
+    count: jax.Array
+    birth: jax.Array
+
+
+class Scorer(NamedTuple):
+    """What scoring needs of every landmark, computed once a frame: predicted value, inverse
+    innovation covariance (for `position`: the covariance without R) and log normaliser; [M, N]."""
+
+    value: tuple
+    matrix: tuple
+    constant: jax.Array
+
+
+def empty(config, dtype):
+    """No landmarks."""
+    shape = (config.landmarks, config.particles)
+    return Landmarks(
+        mean=jnp.zeros((2, *shape), dtype),
+        factor=jnp.zeros((3, *shape), dtype),
+        anchor=jnp.zeros((2, *shape), dtype) if config.sensor == "bearing" else None,
+        log_odds=jnp.zeros(shape, dtype) if config.forgetting else None,
+        count=jnp.zeros(shape, jnp.int32),
+        birth=jnp.zeros(shape, jnp.int32),
+    )
+
+
+def scorer(sensor, seen, landmarks, inlier, by_u=None):
+    """`Scorer` of every slot; empty slots score -inf. `inlier`: log probability added to all.
+
+    `by_u`: rows of the predicted measurement by the pose's own standard normals (see `proposal`),
+    where the pose is not known exactly.
+    """
+    factor = tuple(landmarks.factor)
+    occupied = landmarks.count > 0
+    own = [geometry.transpose_times(factor, row) for row in seen.rows]
+    spread = own if by_u is None else [row + more for row, more in zip(own, by_u, strict=True)]
+
+    def product(i, j):
+        return sum(a * b for a, b in zip(spread[i], spread[j], strict=True))
+
+    s00 = product(0, 0)
+    if sensor == "bearing":
+        shift, extra = bend(own[0], geometry.transpose_times(factor, seen.stretch))
+        s00 = jnp.where(occupied, s00 + extra + seen.noise[0], 1.0)
+        constant = jnp.where(occupied, inlier - 0.5 * (jnp.log(s00) + sensors.LOG_2PI), -jnp.inf)
+        return Scorer((seen.value[0] + shift,), (-0.5 / s00,), constant)
+    s01, s11 = product(0, 1), product(1, 1)
+    if sensor == "position":
+        constant = jnp.where(occupied, inlier - sensors.LOG_2PI, -jnp.inf)
+        return Scorer(seen.value, (s00, s01, s11), constant)
+    s00, s11 = s00 + seen.noise[0], s11 + seen.noise[1]
+    det = jnp.where(occupied, s00 * s11 - s01 * s01, 1.0)
+    constant = jnp.where(occupied, inlier - sensors.LOG_2PI - 0.5 * jnp.log(det), -jnp.inf)
+    inverse = 1 / det
+    matrix = (-0.5 * s11 * inverse, s01 * inverse, -0.5 * s00 * inverse)
+    return Scorer(seen.value, matrix, constant)
+
+
+def score(sensor, scorer, value, cov, params):
+    """log density of a measurement under a landmark; everything broadcasts."""
+    if sensor == "bearing":
+        v0 = wrap(value[0] - scorer.value[0])
+        return scorer.constant + scorer.matrix[0] * v0 * v0
+    v0, v1 = value[0] - scorer.value[0], value[1] - scorer.value[1]
+    if sensor == "position":
+        scale = params.position_scale**2
+        s00, s01, s11 = (p + scale * c for p, c in zip(scorer.matrix, cov, strict=True))
+        det = s00 * s11 - s01 * s01
+        square = (v0 * v0 * s11 - 2 * v0 * v1 * s01 + v1 * v1 * s00) / det
+        return scorer.constant - 0.5 * (square + jnp.log(det))
+    v1 = wrap(v1)
+    a, b, c = scorer.matrix
+    return scorer.constant + v0 * (a * v0 + b * v1) + c * v1 * v1
+
+
+def update(sensor, sensor_pose, mean, factor, anchor, value, cov, params):
+    """One landmark's EKF update: mean, factor, log predictive density of the measurement.
+
+    A 2-D measurement is two whitened scalars, both linearised at the mean before the update.
+    """
+    if sensor == "bearing":
+        return _update_bearing(sensor_pose, mean, factor, anchor, value[0], params)
+    seen = sensors.observe(sensor, sensor_pose, mean, anchor, params)
+    if sensor == "position":
+        innovations, rows, variances = _whiten(seen, value, cov, params)
+    else:
+        innovations = (value[0] - seen.value[0], wrap(value[1] - seen.value[1]))
+        rows, variances = seen.rows, seen.noise
+    mean, factor, square, log = geometry.pair_update(mean, factor, rows, innovations, variances)
+    return mean, factor, -0.5 * (square + log) - sensors.LOG_2PI
+
+
+def bend(along, stretch):
+    """Mean and variance that the bearing's second derivatives add to its prediction.
+
+    `along`, `stretch`: the rows of `sensors.Seen` times the landmark's factor, u and v; the Hessian
+    is then -(u v' + v u').
+    """
+    (u1, u2), (v1, v2) = along, stretch
+    both = u1 * v1 + u2 * v2
+    return -both, (u1 * u1 + u2 * u2) * (v1 * v1 + v2 * v2) + both * both
+
+
+def _update_bearing(sensor_pose, mean, factor, anchor, value, params):
+    """A bearing's update: `NODES` narrower normals along inverse depth, an EKF of
+    second order for each, merged into one normal of the mixture's mean and covariance.
+
+    One EKF is over-confident where the robot drives towards a landmark and past where it took it to
+    be; this keeps to the exact posterior (experiments/inverse_depth.py). Gauss-Hermite nodes with
+    `BETWEEN` of the variance and normals with the rest have the moments of the whole (Gaussian sum:
+    Alspach and Sorenson 1972, doi:10.1109/TAC.1972.1100034).
+    """
+    l11, l21, l22 = factor
+    variance = l21 * l21 + l22 * l22
+    per_sd = 1 / jnp.sqrt(variance)
+    left = 1 / jnp.sqrt(1 - BETWEEN * l21 * l21 * per_sd * per_sd)
+    narrow = (l11 / left, (1 - BETWEEN) * l21 * left, (1 - BETWEEN) ** 0.5 * l22 * left)
+    step = (l11 * l21 * per_sd, variance * per_sd)
+    # Linear in direction: cosines of every part would be most of the work.
+    (dx, dy), (tx, ty), (ax, ay) = sensors.ray(sensor_pose, mean, anchor)
+
+    def one(split):
+        turn, nearer = split[0] * step[0], split[0] * step[1]
+        point = (dx + tx * turn + ax * nearer, dy + ty * turn + ay * nearer)
+        part = (mean[0] + turn, mean[1] + nearer)
+        seen = sensors.along_ray(point, (tx, ty), (ax, ay), part[1], sensor_pose[2], params)
+        (row,), (noise,) = seen.rows, seen.noise
+        spread = geometry.transpose_times(narrow, row)
+        shift, extra = bend(spread, geometry.transpose_times(narrow, seen.stretch))
+        rest = wrap(value - seen.value[0] - shift)
+        part, cov, s = geometry.scalar_update(part, narrow, row, rest, noise + extra)
+        return part, cov, split[1] - 0.5 * (rest * rest / s + jnp.log(s) + sensors.LOG_2PI)
+
+    # A loop, as what it hands on are arrays: else XLA works all out again for each of the sums.
+    split = jax.tree.map(lambda v: jnp.array(v, jnp.result_type(l11)), SPLIT)
+    part, cov, share = jax.lax.map(one, split)
+    top = jax.lax.stop_gradient(share.max(0))
+    log_density = top + jnp.log(added(jnp.exp(share - top)))
+    mean, factor = _merge(part, cov, jnp.exp(share - log_density))
+    return (mean[0], jnp.maximum(mean[1], sensors.LEAST_INVERSE_DEPTH)), factor, log_density
+
+
+def _merge(mean, factor, weight):
+    """Mean and factor of a mixture of normals, along the first axis; sums of squares throughout."""
+    l11, l21, l22 = factor
+    m0, m1 = (added(weight * m) for m in mean)
+    d0, d1 = mean[0] - m0, mean[1] - m1
+    top = jnp.sqrt(added(weight * (l11 * l11 + d0 * d0)))
+    side = added(weight * (l11 * l21 + d0 * d1)) / top
+    slope = side / top
+    off, away = l21 - slope * l11, d1 - slope * d0
+    low = jnp.sqrt(added(weight * (off * off + l22 * l22 + away * away)))
+    return (m0, m1), (top, side, low)
+
+
+def _whiten(seen, value, cov, params):
+    """Two independent scalars out of a position: the second with the first's share taken out."""
+    xx, xy, yy = (component * params.position_scale**2 for component in cov)
+    share = xy / xx
+    v0, v1 = value[0] - seen.value[0], value[1] - seen.value[1]
+    first, second = seen.rows
+    rest = (second[0] - share * first[0], second[1] - share * first[1])
+    return (v0, v1 - share * v0), (first, rest), (xx, yy - share * xy)
+
+
+def in_view(seen, params):
+    """Whether what is predicted lies in the declared view."""
+    inside = (seen.bearing >= params.view_min) & (seen.bearing <= params.view_max)
+    return inside & (seen.range < params.view_range)
+
+
+def existence(world, seen, params):
+    """Log-odds after a frame: matched raises, expected and unseen lowers; below zero is freed.
+
+    `world` is the map after `matched.updated`, with its marks; `seen` the prediction from before.
+    The chance of being seen falls linearly with range, to zero at the declared maximum.
+    """
+    expected = in_view(seen, params)
+    chance = params.detection * jnp.maximum(0.0, 1 - seen.range / params.view_range)
+    raised = jnp.minimum(world.log_odds + params.existence_seen, params.existence_max)
+    lowered = world.log_odds + params.existence_miss * jnp.log1p(-chance)
+    missed = jnp.where((world.count > 0) & expected, lowered, world.log_odds)
+    log_odds = jnp.where(world.count < 0, raised, missed)
+    freed = (world.count != 0) & (log_odds < 0)
+    return world._replace(log_odds=log_odds, count=jnp.where(freed, 0, world.count)), freed.sum(0)
+
+
+def settle(world):
+    """The map with the frame's marks taken off."""
+    return world._replace(count=jnp.abs(world.count))
+
+
+class Table(NamedTuple):
+    """One map for all particles, M slots: world `mean` [2, M], `cov` [3, M], `count`, `birth`, and
+    whether the slot is `kept`: occupied, confirmed, and of known depth."""
+
+    mean: jax.Array
+    cov: jax.Array
+    count: jax.Array
+    birth: jax.Array
+    kept: jax.Array
+
+
+@partial(jax.jit, static_argnames="config")
+def summarise(world, weight, best, params, config):
+    """The map of particle `best`, each landmark averaged over the particles that share its birth.
+
+    The covariance is the mixture's: the mean of the particles' own, and the spread of their means.
+    """
+    shared = sharding.same((best, params))
+    specs = sharding.lanes(world), sharding.lanes(weight), *shared
+    summary = sharding.divided(partial(_summarise, config=config), specs, sharding.ALL, config)
+    return summary(world, weight, best, params)
+
+
+def _summarise(world, weight, best, params, config):
+    mine = sharding.one(world, best, config)
+    centre, _, depth_known = to_world(config.sensor, mine)
+    confirmed = True if mine.log_odds is None else mine.log_odds >= params.existence_confirm
+
+    slots, lane = jnp.arange(len(mine.birth)), jnp.arange(len(weight))
+
+    def one(birth, centre):
+        # Births of one frame may be in other slots where a particle had more of them.
+        same = (world.birth == birth) & (world.count > 0)
+        at = jnp.where(same, slots[:, None], -1).max(0)
+        row = jax.tree.map(lambda leaf: leaf[..., jnp.maximum(at, 0), lane], world)
+        row, share = sharding.whole((row, weight * (at >= 0)), config)
+        point, cov, known = to_world(config.sensor, row)
+        share = jnp.where(known, share, 0)
+        # Pinned: joined with what comes before, sums would be rounded by the number of devices.
+        share = pinned(share / pinned(share).sum())
+        dx, dy = (jnp.where(known, p - c, 0) for p, c in zip(point, centre, strict=True))
+        mx, my = pinned(jnp.stack([share * dx, share * dy])).sum(1)
+        spread = ((dx - mx) ** 2, (dx - mx) * (dy - my), (dy - my) ** 2)
+        parts = [
+            jnp.where(share > 0, share * (own + between), 0)
+            for own, between in zip(cov, spread, strict=True)
+        ]
+        return jnp.stack([centre[0] + mx, centre[1] + my]), pinned(jnp.stack(parts)).sum(1)
+
+    mean, cov = jax.lax.map(lambda args: one(*args), (mine.birth, jnp.stack(centre, -1)))
+    kept = (mine.count > 0) & confirmed & depth_known
+    return Table(mean.T, cov.T, mine.count, mine.birth, kept)
+
+
+def to_world(sensor, world):
+    """World point (x, y), covariance (xx, xy, yy) and whether its depth is known, of every slot.
+
+    An inverse depth counts as known when it is three standard deviations from zero.
+    """
+    if sensor != "bearing":
+        return (
+            tuple(world.mean),
+            geometry.covariance(world.factor),
+            jnp.full(world.count.shape, True),
+        )
+    (angle, depth), (pp, pd, dd) = world.mean, geometry.covariance(world.factor)
+    known = depth > 3 * jnp.sqrt(dd)
+    depth = jnp.where(known, depth, 1.0)
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    # Columns of the Jacobian: by direction, by inverse depth.
+    ax, ay, bx, by = -s / depth, c / depth, -c / depth**2, -s / depth**2
+    cov = (
+        ax * ax * pp + 2 * ax * bx * pd + bx * bx * dd,
+        ax * ay * pp + (ax * by + ay * bx) * pd + bx * by * dd,
+        ay * ay * pp + 2 * ay * by * pd + by * by * dd,
+    )
+    return (world.anchor[0] + c / depth, world.anchor[1] + s / depth), cov, known

@@ -1,0 +1,144 @@
+"""Lazy resampling: landmarks stay where they are, and are read through their ancestors when needed.
+
+Resampling replaces every particle by a copy of its ancestor, map and all. Copying the whole map
+costs more than all else once the map is large, and most of it is not even in view. So only the
+ancestors are recorded. Slots that were last brought up to date between the same two resamplings
+share a chain, which is composed as it grows: `chains[g, i]` is the particle that held then what
+belongs to particle i now. There are few chains; when a new one is needed and all are in use, the
+slots of the oldest are brought up to date.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.filter import halo_exchange, sharding
+from jaxslam.filter.xla import listed, rounds
+
+CURRENT = -1
+TOGETHER = 2**18  # particles of all rows in one message
+
+
+class Ancestry(NamedTuple):
+    """`chains` [G, N] of particles; `begun` [G]: number of the resampling each began with;
+    `chain` [M]: that of every slot, or `CURRENT`; `count` []: resamplings so far."""
+
+    chains: jax.Array
+    begun: jax.Array
+    chain: jax.Array
+    count: jax.Array
+
+
+def new(config):
+    """Nothing to catch up with."""
+    size = min(config.chains, config.landmarks)
+    return Ancestry(
+        chains=jnp.zeros((size, config.particles), jnp.int32),
+        begun=jnp.zeros(size, jnp.int32),
+        chain=jnp.full(config.landmarks, CURRENT, jnp.int32),
+        count=jnp.zeros((), jnp.int32),
+    )
+
+
+def update(world, ancestry, wanted, config):
+    """The map with the slots `wanted` [M] (or all: True) brought up to date.
+
+    In place, row by row: a `take` of the whole map would need a second copy of it.
+    """
+    behind = (ancestry.chain != CURRENT) & wanted
+    slots, count = jnp.nonzero(behind, size=len(behind), fill_value=0)[0], behind.sum()
+    near = 0
+    if halo_exchange.width(config):
+        used = (ancestry.chain == jnp.arange(len(ancestry.begun))[:, None]) & behind
+        enough = halo_exchange.enough(ancestry.chains, config) | ~used.any(1)
+        # One of two loops has no rounds: a `cond` would copy the map.
+        near = jnp.where(enough.all(), count, 0)
+        world = _updated_near(world, ancestry, slots, near, config)
+    world = _updated(world, ancestry, slots, count - near, config)
+    return world, ancestry._replace(chain=jnp.where(behind, CURRENT, ancestry.chain))
+
+
+def _updated(world, ancestry, slots, count, config):
+    """The map with the first `count` of the slots brought up to date."""
+    # Rows travel between devices some at a time.
+    some = 1 if config.devices == 1 else max(1, min(8, TOGETHER // config.particles))
+
+    def update_some(i, world):
+        # Beyond the last comes the last again, which does no harm: all are read before any is put.
+        at = [slots[jnp.minimum(i * some + j, count - 1)] for j in range(some)]
+        rows = [jax.tree.map(partial(_row, slot=slot), world) for slot in at]
+        indices = [_index(ancestry, slot, config) for slot in at]
+        for slot, new in zip(at, sharding.taken(rows, indices, config), strict=True):
+            world = jax.tree.map(partial(_put, slot=slot), world, new)
+        return world
+
+    return rounds(-(-count // some), update_some, world)
+
+
+def _updated_near(world, ancestry, slots, count, config):
+    """`_updated` where the neighbours' borders are all that a device needs of others."""
+    some = max(1, min(8, TOGETHER // (2 * halo_exchange.width(config))))
+
+    def update_some(i, world):
+        first = i * some
+        at = [slots[jnp.minimum(first + j, count - 1)] for j in range(some)]
+        border = halo_exchange.of_slots(world, at, config)
+
+        def update_one(j, world):
+            slot = slots[first + j]
+            taken = partial(halo_exchange.put, slot=slot, index=_index(ancestry, slot, config))
+            side = jax.tree.map(partial(_row, slot=j), border)
+            return jax.tree.map(partial(taken, config=config), world, side)
+
+        return rounds(jnp.minimum(some, count - first), update_one, world)
+
+    return rounds(-(-count // some), update_some, world)
+
+
+def _index(ancestry, slot, config):
+    """Where what a device's particles have in a slot is, among all particles."""
+    return sharding.mine(_row(ancestry.chains, ancestry.chain[slot]), config)
+
+
+def _row(leaf, slot):
+    return jax.lax.dynamic_index_in_dim(leaf, slot, leaf.ndim - 2, keepdims=False)
+
+
+def _put(leaf, new, slot):
+    return jax.lax.dynamic_update_index_in_dim(leaf, new, slot, leaf.ndim - 2)
+
+
+def last_of(ancestry):
+    """Slots [M] of the oldest chain, if all chains are in use: they are due before resampling."""
+    used = _used(ancestry)
+    return used.all() & (ancestry.chain == jnp.argmin(ancestry.begun))
+
+
+def _used(ancestry):
+    return (ancestry.chain == jnp.arange(len(ancestry.begun))[:, None]).any(1)
+
+
+def resampled(ancestry, ancestors, wanted):
+    """`Ancestry` of particles that continue `ancestors` [N] if resampling was `wanted`.
+
+    There must be a chain that is not in use (`last_of`).
+    """
+    used = _used(ancestry)
+    free = jnp.argmin(used).astype(jnp.int32)
+
+    def follow(i, chains):
+        new = _row(chains, which[i]).at[ancestors].get(mode="promise_in_bounds")
+        return _put(chains, new, which[i])
+
+    which, count = listed(used)
+    chains = rounds(jnp.where(wanted, count, 0), follow, ancestry.chains)
+    chains = _put(chains, jnp.where(wanted, ancestors, _row(chains, free)), free)
+    count = ancestry.count + wanted
+    return Ancestry(
+        chains=chains,
+        begun=jnp.where(wanted, ancestry.begun.at[free].set(count), ancestry.begun),
+        chain=jnp.where(wanted & (ancestry.chain == CURRENT), free, ancestry.chain),
+        count=count,
+    )

@@ -1,0 +1,254 @@
+"""Particles shared evenly by several devices, of one process or of several.
+
+Each device moves, associates and updates its own particles. What concerns all (weights, ancestors,
+bounds) is worked out on every device from the same numbers in the same order, so that the result
+is that of one device, bit for bit. Only log weights, poses and, of the landmarks that are about
+to be looked at, what is needed of others travel (`borders`).
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
+
+from jaxslam.filter.xla import pinned
+
+AXIS = "particles"
+ALL = PartitionSpec()  # the same on every device
+PIECE = 2**26  # bytes of an array that all devices get at once
+
+
+def mesh(config):
+    """The devices that share the particles; raises `ValueError` where there are not as many."""
+    return mesh_of(config.devices)
+
+
+def mesh_of(count):
+    """So many devices in a row; raises `ValueError` where there are not as many."""
+    processes = jax.process_count()
+    # Each process has as many of them.
+    share = -(-count // processes)
+    found = [jax.local_devices(i)[:share] for i in range(processes)]
+    found = [device for part in found for device in part]
+    if len(found) != count:
+        raise ValueError(
+            f"Config.devices: {count}, but JAX has {len(jax.devices())} in {processes} "
+            f"{'process' if processes == 1 else 'processes'}; on a CPU set jax_num_cpu_devices, "
+            "or XLA_FLAGS, before JAX is first used"
+        )
+    return jax.sharding.Mesh(np.array(found), (AXIS,), (AxisType.Auto,))
+
+
+def fetched(leaf):
+    """A whole array on this host; every process that shares it must ask, and gets it.
+
+    On a CPU it may be the device's own memory: not to be kept, or the device could not work on it
+    in place.
+    """
+    if leaf.is_fully_replicated:
+        return np.asarray(leaf)
+    whole = np.empty(leaf.shape, leaf.dtype)
+    if leaf.is_fully_addressable:
+        # No `np.asarray`, as the array would keep that copy.
+        for shard in leaf.addressable_shards:
+            whole[shard.index] = shard.data
+        return whole
+    rows = whole.reshape(-1, leaf.shape[-1])
+    some = min(len(rows), max(1, PIECE // rows[:1].nbytes))
+    for start in range(0, len(rows), some):
+        start = min(start, len(rows) - some)
+        part = _rows(leaf, start, some, NamedSharding(leaf.sharding.mesh, ALL))
+        rows[start : start + some] = np.asarray(part)
+    return whole
+
+
+@partial(jax.jit, static_argnames=("some", "sharding"))
+def _rows(leaf, start, some, sharding):
+    """Some rows of an array [..., N], on every device."""
+    part = jax.lax.dynamic_slice_in_dim(leaf.reshape(-1, leaf.shape[-1]), start, some)
+    return jax.lax.with_sharding_constraint(part, sharding)
+
+
+def sent(array, shape):
+    """An array on the devices, a copy: of NumPy's, as `shape` (`ShapeDtypeStruct`) says."""
+    if shape.sharding is None:
+        return jnp.array(array)
+    return jax.make_array_from_callback(
+        shape.shape, shape.sharding, lambda index: jnp.array(array[index])
+    )
+
+
+def agreed(number):
+    """A whole number of process 0, told to all processes; every one of them must ask."""
+    if jax.process_count() == 1:
+        return number
+    return int(multihost_utils.broadcast_one_to_all(np.int32(number)))
+
+
+def told(tree):
+    """Arrays of process 0 (the others' count for their shapes), told to all processes; every one of
+    them must ask."""
+    if jax.process_count() == 1:
+        return tree
+    return jax.tree.map(np.asarray, multihost_utils.broadcast_one_to_all(tree))
+
+
+def leads():
+    """Whether this process speaks and writes for all."""
+    return jax.process_index() == 0
+
+
+def lanes(tree):
+    """`PartitionSpec` of every leaf [..., N] of a tree: the last axis is shared out."""
+    return jax.tree.map(lambda leaf: PartitionSpec(*[None] * (leaf.ndim - 1), AXIS), tree)
+
+
+def same(tree):
+    """`PartitionSpec` of every leaf of a tree: all of it on each device."""
+    return jax.tree.map(lambda leaf: ALL, tree)
+
+
+def shardings(specs, config):
+    """`NamedSharding`s of a tree of `PartitionSpec`s; None: as it comes."""
+    if config.devices == 1:
+        return None
+    over = mesh(config)
+    return jax.tree.map(
+        lambda spec: NamedSharding(over, spec),
+        specs,
+        is_leaf=lambda x: isinstance(x, PartitionSpec),
+    )
+
+
+def divided(function, specs, outcome, config):
+    """The function on every device, with its share of the arguments; as it is for one device."""
+    if config.devices == 1:
+        return function
+    # The check does not know that what was gathered is the same everywhere.
+    return jax.shard_map(
+        function, mesh=mesh(config), in_specs=specs, out_specs=outcome, check_vma=False
+    )
+
+
+def whole(tree, config):
+    """Leaves [..., N] of all particles, on every device, of leaves [..., n] of its own."""
+    if config.devices == 1:
+        return pinned(tree)
+    leaves, kind = jax.tree.flatten(tree)
+    found = list(leaves)
+    for every, rows in _gathered(leaves):
+        every = jnp.moveaxis(every, 0, 1).reshape(every.shape[1], -1)
+        for i, begin, end in rows:
+            part = every[begin:end].reshape(*leaves[i].shape[:-1], -1)
+            found[i] = jax.lax.bitcast_convert_type(part, leaves[i].dtype)
+    return pinned(jax.tree.unflatten(kind, found))
+
+
+def taken(trees, indices, config):
+    """Of each tree the leaves [..., n] at `indices` [n] of all particles, wherever these are."""
+    leaves, kind = jax.tree.flatten(trees)
+    each, found = len(leaves) // len(indices), list(leaves)
+    if config.devices == 1:
+        for i, leaf in enumerate(leaves):
+            rows = np.arange(leaf.size // leaf.shape[-1], dtype=np.int32).reshape(leaf.shape[:-1])
+            found[i] = _at(leaf, rows, indices[i // each])
+        return jax.tree.unflatten(kind, found)
+    for every, parts in _gathered(leaves):
+        count, n = every.shape[1:]
+        # Of a particle's first number, in the order that things came in.
+        first = pinned([index // n * (count * n) + index % n for index in indices])
+        for i, begin, end in parts:
+            rows = np.arange(begin, end, dtype=np.int32).reshape(leaves[i].shape[:-1])
+            part = _at(every, rows, first[i // each])
+            found[i] = jax.lax.bitcast_convert_type(part, leaves[i].dtype)
+    return jax.tree.unflatten(kind, found)
+
+
+def _at(array, rows, index):
+    """Numbers of an array [..., n] at rows [...] and places [n], as if it were one row."""
+    at = rows[..., None] * array.shape[-1] + index
+    return array.reshape(-1).at[at].get(mode="promise_in_bounds")
+
+
+def _gathered(leaves):
+    """The same leaves [..., n] of all devices, in few large messages (a small one costs as much as
+    some ten thousand numbers): of every width of number an array [devices, rows, n], as it comes,
+    and which rows (leaf, from, to) are whose."""
+    for rows, whose in _joined(leaves):
+        yield jax.lax.all_gather(rows, AXIS), whose
+
+
+def _joined(leaves):
+    """Of every width of number an array [rows, n] of the leaves [..., n], and whose rows are whose
+    (leaf, from, to)."""
+    n = leaves[0].shape[-1]
+    for size in sorted({leaf.dtype.itemsize for leaf in leaves}):
+        number = {4: jnp.uint32, 8: jnp.uint64}[size]
+        these = [i for i, leaf in enumerate(leaves) if leaf.dtype.itemsize == size]
+        rows = [jax.lax.bitcast_convert_type(leaves[i], number).reshape(-1, n) for i in these]
+        ends = np.cumsum([0, *map(len, rows)])
+        yield jnp.concatenate(rows), list(zip(these, ends[:-1], ends[1:], strict=True))
+
+
+def of_neighbours(leaves, b, config):
+    """Of leaves [..., 2 b], every device's first and last b: the last of the device before, and the
+    first of the one after it (zeros where there is none)."""
+    found, pairs = list(leaves), range(config.devices - 1)
+    for rows, whose in _joined(leaves):
+        before = jax.lax.ppermute(rows[:, b:], AXIS, [(i, i + 1) for i in pairs])
+        after = jax.lax.ppermute(rows[:, :b], AXIS, [(i + 1, i) for i in pairs])
+        both = jnp.concatenate([before, after], 1)
+        for i, begin, end in whose:
+            part = both[begin:end].reshape(leaves[i].shape)
+            found[i] = jax.lax.bitcast_convert_type(part, leaves[i].dtype)
+    return found
+
+
+def mine(tree, config):
+    """Leaves [..., n] of a device's own particles, of leaves [..., N] of all."""
+    if config.devices == 1:
+        return tree
+    n = config.particles // config.devices
+    start = jax.lax.axis_index(AXIS) * n
+    return jax.tree.map(
+        lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, n, leaf.ndim - 1), tree
+    )
+
+
+def least(values, config):
+    """The least of the devices' values, each for itself; what is not a number stays."""
+    if config.devices == 1:
+        return values
+    return jax.lax.all_gather(values, AXIS).min(0)
+
+
+def total(counts, config):
+    """Sum of whole numbers over the devices."""
+    return counts if config.devices == 1 else jax.lax.psum(counts, AXIS)
+
+
+def one(tree, lane, config):
+    """Leaves [...] of one particle of all, of leaves [..., n] of a device's own."""
+    if config.devices == 1:
+        return jax.tree.map(lambda leaf: leaf[..., lane], tree)
+    holder, at = jnp.divmod(lane, config.particles // config.devices)
+    return jax.tree.map(lambda leaf: jax.lax.all_gather(leaf[..., at], AXIS)[holder], tree)
+
+
+def spread(one, items, count):
+    """`one` of every item (first axis), shared out over so many devices; on each, one at a time."""
+    total = len(jax.tree.leaves(items)[0])
+    if count == 1 or total == 1:
+        return jax.lax.map(one, items)
+    # Filled up with the first ones, so that all devices have as many.
+    index = np.arange(-(-total // count) * count) % total
+    share = PartitionSpec(AXIS)
+    mapped = jax.shard_map(
+        lambda part: jax.lax.map(one, part),
+        mesh=mesh_of(count), in_specs=share, out_specs=share, check_vma=False,
+    )  # fmt: skip
+    found = mapped(jax.tree.map(lambda leaf: leaf[index], items))
+    return jax.tree.map(lambda leaf: leaf[:total], found)

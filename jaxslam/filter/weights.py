@@ -1,0 +1,43 @@
+"""Weights of all particles: normalised, and what they say of the pose."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.filter.xla import pinned
+from jaxslam.models.geometry import wrap
+
+
+class Estimate(NamedTuple):
+    """Mean pose [3], its covariance [3, 3], and the particle of greatest weight."""
+
+    mean: jax.Array
+    cov: jax.Array
+    best: jax.Array
+
+
+def weigh(log_weight, density):
+    """Normalised log weights, log evidence of the step, and flags (non-finite, degenerate)."""
+    raw = pinned(log_weight + density)
+    finite = jnp.isfinite(raw)
+    # A particle that already had no weight is not news.
+    nonfinite = jnp.sum(~finite & (log_weight > -jnp.inf))
+    degenerate = ~finite.any()
+    log_evidence = jax.nn.logsumexp(jnp.where(finite, raw, -jnp.inf))
+    even = jnp.full_like(raw, -jnp.log(len(raw)))
+    normalised = jnp.where(finite, raw - log_evidence, -jnp.inf)
+    log_weight = pinned(jnp.where(degenerate, even, normalised))
+    return log_weight, log_evidence, (nonfinite, degenerate)
+
+
+def estimated(pose, weight):
+    """Weighted mean (circular in heading) and covariance of the poses, and the heaviest one."""
+    # Sums, not matrix products: how these add up depends on the number of threads.
+    x, y, heading = pose
+    parts = jnp.stack([x, y, jnp.sin(heading), jnp.cos(heading)])
+    x_mean, y_mean, s, c = pinned(parts * weight).sum(1)
+    mean = jnp.stack([x_mean, y_mean, jnp.arctan2(s, c)])
+    off = pinned(jnp.stack([x - mean[0], y - mean[1], wrap(heading - mean[2])]))
+    cov = pinned(off[:, None] * (off * weight)).sum(2)
+    return Estimate(mean, cov, jnp.argmax(weight))

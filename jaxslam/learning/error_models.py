@@ -1,0 +1,135 @@
+"""Which error model of the sensor the data prefer: each is learnt, and judged on held-out logs.
+
+The paper takes a measurement for a 2-D normal point. Alternatives for what is measured as range
+and bearing, or bearing alone: normal; normal sideways noise that is the larger the nearer (what is
+seen has a size: `growth`); either with a share `outlier` of measurements from anywhere in the view
+(heavy-tailed). Evidences of one log are comparable only as densities of the same thing: that of a
+point (x, y) is per m^2, that of (range, bearing) per m rad, and r times as large, since
+dx dy = r dr dbearing. The sum of log r over the measurements is added to the former.
+Of a point's covariance only the scale is learnt: it is made with the noise that the fit began with.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.config import UNITS
+from jaxslam.filter.frames import frames
+from jaxslam.learning import fit
+from jaxslam.learning.likelihood import OF_MOTION
+
+FRESH = 8  # seeds that judge
+GROWTH = 0.02  # m: where growth starts if it is 0; its logarithm is learnt
+OUTLIER = 0.01
+SURE = 3.0  # standard errors of a difference, from which on it is a preference
+NAMES = ("normal", "range_dependent", "heavy_tailed", "heavy_tailed+range_dependent", "point")
+
+
+class Judged(NamedTuple):
+    """A model: parameters `values` learnt, and log `evidence` [seeds] of `count` held-out
+    measurements, per m rad (bearings alone: per rad)."""
+
+    model: str
+    values: dict
+    evidence: np.ndarray
+    count: int
+
+    @property
+    def finite(self):
+        """Whether its evidence is a number."""
+        return bool(np.isfinite(self.evidence).all())
+
+
+def compare(train, held_out, config, params, names=(), seeds=4, steps=150, seed=0, progress=None):
+    """A `Judged` per model: lists of `Log`s to learn from and to judge by.
+
+    Of `names` the motion's are learnt with each model; `params` are where all start. `progress`:
+    called with (models done, models). Raises `ValueError` for sensor `position`, whose points have
+    no range and bearing to be compared by.
+    """
+    if config.sensor not in ("range_bearing", "bearing"):
+        raise ValueError(f"error models of sensor {config.sensor}: need ranges or bearings")
+    models = NAMES if config.sensor == "range_bearing" else NAMES[:-1]
+    rows = []
+    for done, model in enumerate(models):
+        if progress:
+            progress(done, len(models))
+        rows.append(_judged(model, train, held_out, config, params, names, seeds, steps, seed))
+    return rows
+
+
+def model_of(model, config, params):
+    """`Config`, start `Params` and the sensor's names to learn of a model."""
+    heavy, ranged = "heavy_tailed" in model, "range_dependent" in model
+    # The noise is all in the model: nothing is added to it.
+    sigma = float(np.hypot(params.sigma_bearing, params.caution))
+    params = params._replace(sigma_bearing=sigma, caution=0.0)
+    config = dataclasses.replace(config, clutter=heavy)
+    if model == "point":
+        return dataclasses.replace(config, sensor="position"), params, ("position_scale",)
+    names = ("sigma_range",) if config.sensor == "range_bearing" else ()
+    names += ("sigma_bearing",) + ("growth",) * ranged + ("outlier",) * heavy
+    growth = (params.growth or GROWTH) if ranged else 0.0
+    return config, params._replace(growth=growth, outlier=params.outlier or OUTLIER), names
+
+
+def _judged(model, train, held_out, config, params, names, seeds, steps, seed):
+    config, start, own = model_of(model, config, params)
+    if model == "point":
+        train, held_out = ([_without_points(log) for log in logs] for logs in (train, held_out))
+    names = (*(name for name in names if name in OF_MOTION), *own)
+    found = fit.fit(train, config, start, names, held_out, seeds=seeds, steps=steps, seed=seed)
+    # Positions are made with the noise they were learnt with, whose scale is then the fit's.
+    evidence = fit.evidence(held_out, config, found.params, FRESH, seed + 7919)
+    used = [_ranges(log, config, start) for log in held_out]
+    if model == "point":
+        evidence = evidence + sum(np.log(ranges).sum() for ranges in used)
+    values = {name: getattr(found.params, name) for name in names}
+    return Judged(model, values, evidence, sum(map(len, used)))
+
+
+def _without_points(log):
+    """The log with points only as its ranges and bearings make them."""
+    return dataclasses.replace(log, point=None, point_cov=None, point_baseline=None)
+
+
+def _ranges(log, config, params):
+    """Ranges [n] of the measurements that find a slot (ones, where none was measured)."""
+    known = config.association == "known"
+    row = frames(log, config.sensor, config.measurements, params, known).row
+    ranges = np.ones(len(log.frame)) if log.range is None else log.range
+    return ranges[row[row >= 0]]
+
+
+def table(rows):
+    """Text: a line per model, the best first."""
+    rows = sorted(rows, key=lambda row: -_mean(row))
+    lines = [f"{'error model':30}{'held-out evidence':>24}{'to the best':>16}  learnt"]
+    for row in rows:
+        told = f"{np.mean(row.evidence):.2f} ± {np.std(row.evidence, ddof=1):.2f}"
+        behind = f"{_mean(row) - _mean(rows[0]):.2f}"
+        values = (f"{name} {value:.3g} {UNITS[name]}" for name, value in row.values.items())
+        lines.append(f"{row.model:30}{told:>24}{behind:>16}  {', '.join(values)}")
+    return "\n".join(lines)
+
+
+def preferred(rows):
+    """A sentence: which model the held-out logs prefer, and by how much."""
+    best, second = sorted(rows, key=lambda row: -_mean(row))[:2]
+    ahead = _mean(best) - _mean(second)
+    error = np.hypot(
+        *(np.std(r.evidence, ddof=1) / np.sqrt(len(r.evidence)) for r in (best, second))
+    )
+    each = f"{ahead:.1f} nats, {ahead / max(best.count, 1):.2g} per measurement"
+    if not ahead > SURE * error:
+        return (
+            f"no preference: {best.model} is ahead of {second.model} by {each}, "
+            f"with a standard error of {error:.1f}"
+        )
+    return f"the held-out logs prefer {best.model}: ahead of {second.model} by {each}"
+
+
+def _mean(row):
+    """Mean evidence; what is not finite comes last."""
+    return float(np.mean(row.evidence)) if row.finite else -np.inf

@@ -1,0 +1,379 @@
+"""The log: what a robot drove and measured, and the file that keeps it.
+
+The border of the project: left of it sensors, images and foreign files, right of it the filter.
+Stamps are int64 nanoseconds of one clock; lengths metres; angles radians, counter-clockwise, x
+forward. A file is one `.npz` whose entries are the fields below by name, those of the truth and
+the plan under `truth/` and `plan/`, and numbers under `noise/` and `skipped/`. Never pickled.
+"""
+
+import math
+import zipfile
+from dataclasses import dataclass, field, fields
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from jaxslam.config import Params
+from jaxslam.files import replacing
+from jaxslam.logs.validation import assign, check_rows, check_stamps, checked, checked_number
+
+SCHEMA = 1
+BUNDLED = ("lost-in-the-woods",)
+# Rows by design not for the filter (another robot seen) are counted under reasons that start so.
+NOT_USED = "not used: "
+KINDS = ("velocity", "command")
+MAX_BYTES = 1 << 30  # all entries together, unpacked
+MAX_ENTRIES = 1000
+MAX_DIMENSIONS = 4
+MAX_TEXT_BYTES = 1 << 16
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What was true, where known; the filter never gets it.
+
+    `time` int64 [P] ns with `pose` [P, 3] (x, y, heading); `landmarks` [L, 2] with `landmark_id`
+    int64 [L]; `identity` int64 [n]: the true landmark's id per measurement, -1 for clutter;
+    `resolution` [m] of the poses (0: exact; 0.3 for readings off floor tiles). None: not known.
+    """
+
+    time: np.ndarray | None = None
+    pose: np.ndarray | None = None
+    landmarks: np.ndarray | None = None
+    landmark_id: np.ndarray | None = None
+    identity: np.ndarray | None = None
+    resolution: float = 0.0
+
+    def __post_init__(self):
+        assign(self, "time", checked("truth.time", self.time, np.int64, (None,)))
+        poses = None if self.time is None else len(self.time)
+        assign(self, "pose", checked("truth.pose", self.pose, np.float64, (poses, 3)))
+        if (self.time is None) != (self.pose is None):
+            raise ValueError("truth: time and pose must be given together")
+        if self.time is not None:
+            check_stamps("truth.time", self.time)
+        assign(self, "landmarks", checked("truth.landmarks", self.landmarks, np.float64, (None, 2)))
+        count = 0 if self.landmarks is None else len(self.landmarks)
+        ids = checked("truth.landmark_id", self.landmark_id, np.int64, (count,))
+        if ids is not None and len(np.unique(ids)) != len(ids):
+            raise ValueError("truth.landmark_id: the same id stands for two landmarks")
+        assign(self, "landmark_id", ids)
+        assign(self, "identity", checked("truth.identity", self.identity, np.int64, (None,)))
+        if self.identity is not None:
+            check_rows("truth.identity", self.identity, self.identity >= -1, "must be -1 or more")
+        assign(self, "resolution", checked_number("truth.resolution", self.resolution, least=0))
+
+
+@dataclass(frozen=True, eq=False)
+class FloorPlan:
+    """To be drawn under a map: `segments` [S, 4] (x1, y1, x2, y2) in m, or `image` uint8 [H, W].
+
+    The image has `scale` m per pixel and its lower-left corner at `origin`.
+    """
+
+    segments: np.ndarray | None = None
+    image: np.ndarray | None = None
+    scale: float = 1.0
+    origin: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self):
+        if self.segments is None and self.image is None:
+            raise ValueError("plan: has neither segments nor an image")
+        assign(self, "segments", checked("plan.segments", self.segments, np.float64, (None, 4)))
+        assign(self, "image", checked("plan.image", self.image, np.uint8, (None, None)))
+        assign(self, "scale", checked_number("plan.scale", self.scale))
+        if self.scale <= 0:
+            raise ValueError(f"plan.scale: {self.scale} m per pixel; must be above 0")
+        assign(
+            self, "origin", tuple(checked("plan.origin", self.origin, np.float64, (2,)).tolist())
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Log:
+    """One logged run, validated when made; arrays are read-only copies.
+
+    `odometry` [O, 2] of kind "velocity" (forward m/s, yaw rate rad/s, held from its stamp until the
+    next) or "command" (distance m, then turn rad, executed in the interval that ends at its stamp).
+    `frame_time` [F] is every time the sensor looked, also when it saw nothing; `frame` [n] is the
+    frame of each measurement. `bearing` [n], `range` [n], `point` [n, 2] and `point_cov` [n, 3]
+    (xx, xy, yy) are in the sensor's frame, NaN where a bearing has no point; `point_baseline` [n]
+    is the distance by odometry that a point's size rests on, NaN where it rests on none; so a gain
+    of the odometry rescales it. `bearing_sigma` [n] rad is the standard deviation of a bearing as
+    its detector states it. `identity` [n] is measured, -1 where none was.
+    `view` (least bearing, largest bearing, largest range) is what the sensor can see, `mounting`
+    (x, y, yaw) its pose on the robot, `time_offset` [s] what was added to the frames' stamps.
+    `noise` declares values of `Params`. `start_pose`, `start_cov`: where the robot was at `start`.
+    `skipped`: rows the reader dropped, by reason.
+
+    Raises `ValueError` naming field, row and what is allowed.
+    """
+
+    name: str
+    odometry_time: np.ndarray
+    odometry: np.ndarray
+    odometry_kind: str = "velocity"
+    frame_time: np.ndarray
+    frame: np.ndarray
+    bearing: np.ndarray | None = None
+    bearing_sigma: np.ndarray | None = None
+    range: np.ndarray | None = None
+    point: np.ndarray | None = None
+    point_cov: np.ndarray | None = None
+    point_baseline: np.ndarray | None = None
+    identity: np.ndarray | None = None
+    descriptor: np.ndarray | None = None
+    view: tuple[float, float, float]
+    mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    time_offset: float = 0.0
+    noise: dict[str, float] = field(default_factory=dict)
+    start_pose: np.ndarray = (0.0, 0.0, 0.0)
+    start_cov: np.ndarray = ((0.0, 0.0, 0.0),) * 3
+    truth: Truth | None = None
+    plan: FloorPlan | None = None
+    skipped: dict[str, int] = field(default_factory=dict)
+
+    def __post_init__(self):
+        if not isinstance(self.name, str) or not self.name.isprintable() or not self.name:
+            raise ValueError(f"name: {self.name!r} is not one line of text")
+        _check_odometry(self)
+        _check_measurements(self)
+        _check_sensor(self)
+        _check_start(self)
+        if self.truth is not None and self.truth.identity is not None:
+            checked("truth.identity", self.truth.identity, np.int64, (len(self.frame),))
+        skipped = {
+            str(k): checked_number(f"skipped/{k}", v, least=0) for k, v in self.skipped.items()
+        }
+        assign(self, "skipped", {reason: int(count) for reason, count in skipped.items()})
+
+    def __repr__(self):
+        rows = f"{len(self.odometry)} odometry rows, {len(self.frame_time)} frames"
+        return f"Log({self.name!r}: {rows}, {len(self.frame)} measurements)"
+
+    @property
+    def start(self):
+        """Stamp [ns] at which `start_pose` holds: the first odometry or frame."""
+        return min(int(self.odometry_time[0]), int(self.frame_time[0]))
+
+    def has(self, sensor):
+        """Whether the log can supply a sensor: position, range_bearing or bearing."""
+        bearing, both = self.bearing is not None, self.range is not None  # a range has a bearing
+        supplies = {"position": self.has_points() or both, "range_bearing": both}
+        return (supplies | {"bearing": bearing}).get(sensor, False)
+
+    def has_points(self):
+        """Whether some row has a point."""
+        return self.point is not None and bool((~np.isnan(self.point)).any() or not len(self.frame))
+
+
+def _check_odometry(log):
+    if log.odometry_kind not in KINDS:
+        raise ValueError(f"odometry_kind: {log.odometry_kind!r} is not one of {', '.join(KINDS)}")
+    assign(log, "odometry_time", checked("odometry_time", log.odometry_time, np.int64, (None,)))
+    rows = len(log.odometry_time)
+    if rows == 0:
+        raise ValueError("odometry_time: the log has no odometry")
+    check_stamps("odometry_time", log.odometry_time)
+    assign(log, "odometry", checked("odometry", log.odometry, np.float64, (rows, 2)))
+
+
+def _check_measurements(log):
+    assign(log, "frame_time", checked("frame_time", log.frame_time, np.int64, (None,)))
+    frames = len(log.frame_time)
+    if frames == 0:
+        raise ValueError("frame_time: the log has no frames")
+    check_stamps("frame_time", log.frame_time)
+    frame = checked("frame", log.frame, np.int64, (None,))
+    assign(log, "frame", frame)
+    check_rows("frame", frame, (frame >= 0) & (frame < frames), f"must be in 0..{frames - 1}")
+    check_rows("frame", frame, np.diff(frame, prepend=frame[:1]) >= 0, "must not decrease")
+    n = len(frame)
+    for name, dtype, shape in (
+        ("bearing", np.float64, (n,)),
+        ("bearing_sigma", np.float64, (n,)),
+        ("range", np.float64, (n,)),
+        ("point", np.float64, (n, 2)),
+        ("point_cov", np.float64, (n, 3)),
+        ("point_baseline", np.float64, (n,)),
+        ("identity", np.int64, (n,)),
+        ("descriptor", np.float32, (n, None)),
+    ):
+        gaps = name.startswith("point")
+        assign(log, name, checked(name, getattr(log, name), dtype, shape, gaps))
+    if log.bearing is None and log.point is None:
+        raise ValueError("bearing: the log has neither bearings nor points")
+    for name, needs in (
+        ("bearing_sigma", "bearing"),
+        ("range", "bearing"),
+        ("point", "point_cov"),
+        ("point_cov", "point"),
+        ("point_baseline", "point"),
+    ):
+        if getattr(log, name) is not None and getattr(log, needs) is None:
+            raise ValueError(f"{name}: given without {needs}")
+    if log.bearing is not None:
+        plausible = np.abs(log.bearing) <= 2 * math.pi
+        check_rows("bearing", log.bearing, plausible, "is beyond 2 pi rad (degrees? times pi/180)")
+    for name in ("bearing_sigma", "range"):
+        value = getattr(log, name)
+        if value is not None:
+            check_rows(
+                name, value, value > 0, f"must be above 0 {'m' if name == 'range' else 'rad'}"
+            )
+    if log.point is not None:
+        _check_points(log)
+    if log.identity is not None:
+        check_rows("identity", log.identity, log.identity >= -1, "must be -1 or more")
+
+
+def _check_points(log):
+    xx, xy, yy = log.point_cov.T
+    missing = np.isnan(xx)
+    definite = (xx > 0) & (yy > 0) & (xx * yy > xy * xy)
+    check_rows("point_cov", log.point_cov, definite | missing, "is not positive definite")
+    alike = np.isnan(log.point[:, 0]) == missing
+    check_rows("point", log.point, alike, "and its point_cov must both be given, or both be NaN")
+    if log.bearing is None:
+        check_rows("point", log.point, ~missing, "is no point, and the row has no bearing either")
+    if log.point_baseline is not None:
+        base = log.point_baseline
+        good = np.isnan(base) | ((base > 0) & ~missing)
+        check_rows("point_baseline", base, good, "must be above 0 m, and NaN without a point")
+
+
+def _check_sensor(log):
+    least, largest, reach = checked("view", log.view, np.float64, (3,)).tolist()
+    # The filter compares with bearings in [-pi, pi); turn the mounting, not the view.
+    if not -math.pi - 1e-9 <= least < largest <= math.pi + 1e-9 or reach <= 0:
+        rule = "must be least and largest bearing within -pi..pi rad, and a range above 0 m"
+        raise ValueError(f"view: {(least, largest, reach)} {rule}")
+    assign(log, "view", (least, largest, reach))
+    assign(log, "mounting", tuple(checked("mounting", log.mounting, np.float64, (3,)).tolist()))
+    assign(log, "time_offset", checked_number("time_offset", log.time_offset))
+    for name in log.noise:
+        if name not in Params._fields:
+            allowed = ", ".join(Params._fields)
+            raise ValueError(f"noise/{name}: no such parameter; allowed: {allowed}")
+    assign(log, "noise", {k: checked_number(f"noise/{k}", v) for k, v in log.noise.items()})
+
+
+def _check_start(log):
+    assign(log, "start_pose", checked("start_pose", log.start_pose, np.float64, (3,)))
+    cov = checked("start_cov", log.start_cov, np.float64, (3, 3))
+    size = max(np.abs(cov).max(), 1e-300)
+    if np.abs(cov - cov.T).max() > 1e-9 * size or np.linalg.eigvalsh(cov)[0] < -1e-9 * size:
+        raise ValueError("start_cov: is not a covariance (symmetric, no negative variance)")
+    assign(log, "start_cov", cov)
+
+
+def save_log(path, log):
+    """Write a log to `path` (.npz), all or nothing: an interrupted write leaves the old file.
+
+    Raises `ValueError` when the place can't be written.
+    """
+    path = Path(path)
+    if path.suffix != ".npz":
+        raise ValueError(f"{path}: a log is a .npz file; name it {path.name}.npz")
+    with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
+        for name, array in entries(log).items():
+            # A fixed date: the same log makes the same bytes.
+            entry = zipfile.ZipInfo(name + ".npy", (1980, 1, 1, 0, 0, 0))
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            with archive.open(entry, "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
+
+
+def entries(log):
+    """The file's entries, by name."""
+    entries = {"schema": np.int64(SCHEMA)}
+    for part, prefix in ((log, ""), (log.truth, "truth/"), (log.plan, "plan/")):
+        for item in fields(part) if part is not None else ():
+            value = getattr(part, item.name)
+            if isinstance(value, dict):
+                entries |= {f"{item.name}/{key}": np.asarray(v) for key, v in value.items()}
+            elif value is not None and item.name not in ("truth", "plan"):
+                entries[prefix + item.name] = np.asarray(value)
+    return entries
+
+
+def load_log(path):
+    """The log in a `.npz` file, or the bundled one of that name (`lost-in-the-woods`).
+
+    Raises `ValueError` naming the file and what is wrong with it.
+    """
+    if str(path) in BUNDLED and not Path(path).exists():
+        source = resources.files("jaxslam") / "data" / f"{path}.npz"
+        with resources.as_file(source) as file:
+            return load_log(file)
+    path = Path(path)
+    if path.is_dir() or path.suffix.lower() in (".mat", ".csv", ".dat"):
+        raise ValueError(f"{path}: is no log; make one of it with: jaxslam convert {path} OUT.npz")
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file (bundled logs: {', '.join(BUNDLED)})")
+    try:
+        return _build(_read_entries(path))
+    except Exception as err:  # foreign bytes: zipfile, zlib and NumPy raise whatever they like
+        reason = (str(err).splitlines() or [type(err).__name__])[0]
+        raise ValueError(f"{path}: not a log, or damaged: {reason}") from err
+
+
+def _read_entries(path):
+    """The file's arrays by name, each checked against the caps before a byte of it is unpacked."""
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        size = sum(member.file_size for member in members)
+        if len(members) > MAX_ENTRIES or size > MAX_BYTES:
+            found = f"{len(members)} entries of {size} bytes"
+            raise ValueError(f"{found}; allowed are {MAX_ENTRIES} of {MAX_BYTES}")
+        entries = {}
+        for member in members:
+            name = member.filename.removesuffix(".npy")
+            if name == member.filename or name in entries:
+                raise ValueError(f"entry {member.filename!r} is no array, or there twice")
+            with archive.open(member) as file:
+                _check_header(name, file, member.file_size)
+            with archive.open(member) as file:
+                entries[name] = np.lib.format.read_array(file, allow_pickle=False)
+                if file.read(1):  # also reaches the end, where the checksum is compared
+                    raise ValueError(f"entry {name!r} is longer than its array")
+    return entries
+
+
+def _check_header(name, file, size):
+    """Refuse objects and shapes that do not fit the entry's size."""
+    old = np.lib.format.read_magic(file) == (1, 0)
+    read = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    if dtype.kind not in "iufU":
+        raise ValueError(f"entry {name!r} holds {dtype}; only numbers and text are allowed")
+    if len(shape) > MAX_DIMENSIONS or min(shape, default=0) < 0:
+        raise ValueError(f"entry {name!r} has shape {shape}; at most {MAX_DIMENSIONS} dimensions")
+    data = math.prod(shape) * dtype.itemsize
+    if data != size - file.tell() or (dtype.kind == "U" and data > MAX_TEXT_BYTES):
+        raise ValueError(f"entry {name!r} of shape {shape} can't be {size} bytes long")
+
+
+def _build(entries):
+    """A `Log` of the file's entries."""
+    schema = entries.pop("schema", None)
+    if schema is None or schema.tolist() != SCHEMA:
+        raise ValueError(f"it has schema {schema}; this version reads {SCHEMA}")
+    parts = {"": {}, "truth": {}, "plan": {}, "noise": {}, "skipped": {}}
+    allowed = {"": Log, "truth": Truth, "plan": FloorPlan}
+    for name, array in entries.items():
+        head, slash, tail = name.partition("/")
+        part, key = (head, tail) if slash else ("", name)
+        owner = allowed.get(part)
+        known = part in parts and (owner is None or key in [f.name for f in fields(owner)])
+        if not known or name in parts:
+            raise ValueError(f"unknown entry {name!r}")
+        parts[part][key] = array.item() if array.ndim == 0 else array
+    values = parts[""]
+    for name in ("name", "odometry_time", "odometry", "frame_time", "frame", "view"):
+        if name not in values:
+            raise ValueError(f"it has no entry {name!r}")
+    truth = Truth(**parts["truth"]) if parts["truth"] else None
+    plan = FloorPlan(**parts["plan"]) if parts["plan"] else None
+    return Log(**values, noise=parts["noise"], skipped=parts["skipped"], truth=truth, plan=plan)

@@ -1,0 +1,200 @@
+"""The sensors: `position` (the paper's), `range_bearing` and `bearing`.
+
+All measure in the sensor's frame, whose pose is the robot's composed with the mounting. Functions
+are written for one particle and one landmark; components may also be arrays that broadcast, and
+the filter passes all at once. A landmark is its mean, the lower factor of its covariance and, for
+`bearing`, its anchor: `position` and `range_bearing` keep the point in the world (x, y);
+`bearing` keeps (direction, inverse depth) as seen from the anchor, the sensor's position when the
+landmark was created, so that it is a 2-D normal from the first glimpse on (Civera, Davison and
+Montiel 2008, in the plane; given the particle's path the anchor is known exactly).
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.models import geometry
+from jaxslam.models.geometry import direction, norm, wrap
+
+LEAST_INVERSE_DEPTH = 1e-3
+TURNING = 0.1  # m/rad: turning makes errors new as so much driving does
+MOST_INFLATION = 1e4  # of a variance, when the robot stands
+LOG_2PI = math.log(2 * math.pi)
+
+
+class Measurements(NamedTuple):
+    """One frame's measurements in K slots (or T frames', stacked).
+
+    `value` [K, 2]: (range, bearing), (x, y) or (bearing, 0). `cov` [K, 3]: (xx, xy, yy) of a
+    position, else zero. `identity` [K]: index of a measured identity, -1 if none. `valid` [K].
+    `active` []: whether the sensor looked at all. `scale` [K]: 1 where a position's size rests on
+    odometry, else 0; None: nowhere. `descriptor` [K, J] and `within` [J]: looks and their variance
+    for one landmark (`looks.Space`); None: there are none.
+    """
+
+    value: jax.Array
+    cov: jax.Array
+    identity: jax.Array
+    valid: jax.Array
+    active: jax.Array
+    scale: jax.Array | None = None
+    descriptor: jax.Array | None = None
+    within: jax.Array | None = None
+
+
+class Seen(NamedTuple):
+    """Prediction of one landmark: its measurement, rows of the Jacobian, noise, where it is.
+
+    `stretch`: for `bearing`, the derivative by the landmark of the logarithm of `ray`'s length.
+    With the bearing's row h, the bearing's Hessian is -(stretch h' + h stretch'), but for the
+    curvature of the ray's own direction.
+    """
+
+    value: tuple
+    rows: tuple
+    noise: tuple
+    range: jax.Array
+    bearing: jax.Array
+    stretch: tuple = ()
+
+
+def rescaled(measurements, params):
+    """The measurements with positions that rest on odometry in true metres: times `gain_tran`.
+
+    A triangle over a distance d is as much too small as d is. The covariances stay: the gain is
+    within per cents of 1.
+    """
+    if measurements.scale is None:
+        return measurements
+    gain = 1 + measurements.scale * (params.gain_tran - 1)
+    return measurements._replace(value=measurements.value * gain[:, None])
+
+
+def correlated(params, odometry):
+    """`Params` whose measurement noise is that of one independent measurement per correlation.
+
+    Errors that follow a first-order autoregression in the travelled path d have correlation
+    exp(-d / correlation) from frame to frame; many such frames tell as much as independent ones
+    with coth(d / (2 correlation)) times the variance. Turning counts a little (`TURNING`): a lens's
+    errors change with it, and without any looks a turn in place would lose the heading, which
+    errors that stay alike do not spoil (experiments/correlation.py).
+    """
+    on = params.correlation > 0
+    travel = odometry.distance + TURNING * odometry.turn
+    half = travel / (2 * jnp.where(on, params.correlation, 1.0))
+    inflation = 1 / jnp.tanh(jnp.clip(half, 1 / MOST_INFLATION, 10.0))
+    root = jnp.where(on, jnp.sqrt(inflation), 1.0)
+    names = ("sigma_bearing", "growth", "sigma_range", "position_scale")
+    return params._replace(**{name: getattr(params, name) * root for name in names})
+
+
+def pose_of(pose, params):
+    """The sensor's pose from the robot's."""
+    return geometry.compose(pose, (params.mount_x, params.mount_y, params.mount_yaw))
+
+
+def bearing_variance(r, params):
+    """Variance of a bearing [rad^2] at range `r`: what is seen has a size (`growth`, m)."""
+    return params.sigma_bearing**2 + (params.growth / r) ** 2
+
+
+def ray(sensor_pose, mean, anchor):
+    """A `bearing` landmark from the sensor, in world axes and divided by its depth: (x, y); and its
+    derivatives by direction and by inverse depth, in which latter it is linear."""
+    c, s = jnp.cos(mean[0]), jnp.sin(mean[0])
+    ax, ay = anchor[0] - sensor_pose[0], anchor[1] - sensor_pose[1]
+    return (mean[1] * ax + c, mean[1] * ay + s), (-s, c), (ax, ay)
+
+
+def along_ray(point, by_direction, by_depth, depth, heading, params):
+    """`Seen` of what `ray` gave."""
+    (dx, dy), (tx, ty), (ax, ay) = point, by_direction, by_depth
+    q = norm(dx, dy)
+    bearing = wrap(direction(dy, dx) - heading)
+    scale = 1 / (q * q)
+    row = ((dx * ty - dy * tx) * scale, (dx * ay - dy * ax) * scale)
+    stretch = ((dx * tx + dy * ty) * scale, (dx * ax + dy * ay) * scale)
+    r = q / jnp.maximum(depth, LEAST_INVERSE_DEPTH)
+    variance = params.sigma_bearing**2 + (params.growth * depth / q) ** 2
+    return Seen((bearing,), (row,), (variance,), r, bearing, stretch)
+
+
+def observe(sensor, sensor_pose, mean, anchor, params):
+    """`Seen` of a landmark; `noise` holds the variances, and is empty for `position`."""
+    sx, sy, heading = sensor_pose
+    if sensor == "bearing":
+        return along_ray(*ray(sensor_pose, mean, anchor), mean[1], heading, params)
+    dx, dy = mean[0] - sx, mean[1] - sy
+    r = norm(dx, dy)
+    bearing = wrap(direction(dy, dx) - heading)
+    if sensor == "position":
+        c, s = jnp.cos(heading), jnp.sin(heading)
+        return Seen((c * dx + s * dy, c * dy - s * dx), ((c, s), (-s, c)), (), r, bearing)
+    inverse = 1 / r  # one division: XLA repeats this for everything that is worked out from it
+    c, s = dx * inverse, dy * inverse
+    rows = ((c, s), (-s * inverse, c * inverse))
+    noise = (params.sigma_range**2, bearing_variance(r, params))
+    return Seen((r, bearing), rows, noise, r, bearing)
+
+
+def locate(sensor, sensor_pose, value, cov, params):
+    """A new landmark from one measurement: mean, factor, anchor (the inverse of `observe`)."""
+    sx, sy, heading = sensor_pose
+    anchor = (sx, sy)
+    if sensor == "bearing":
+        variance = params.sigma_bearing**2 + (params.growth * params.inv_depth_mean) ** 2
+        mean = (heading + value[0], params.inv_depth_mean + jnp.zeros_like(sx))
+        zero = jnp.zeros_like(sx)
+        return mean, (jnp.sqrt(variance) + zero, zero, params.inv_depth_sd + zero), anchor
+    if sensor == "position":
+        px, py = value
+        c, s = jnp.cos(heading), jnp.sin(heading)
+        xx, xy, yy = (component * params.position_scale**2 for component in cov)
+        top = c * c * xx - 2 * c * s * xy + s * s * yy
+        side = c * s * (xx - yy) + (c * c - s * s) * xy
+        factor = geometry.cholesky(top, side, xx * yy - xy * xy)
+        return (sx + c * px - s * py, sy + s * px + c * py), factor, anchor
+    r, b = value
+    r = jnp.maximum(r, 1e-6)
+    c, s = jnp.cos(heading + b), jnp.sin(heading + b)
+    along, across = params.sigma_range**2, r**2 * bearing_variance(r, params)
+    factor = geometry.cholesky(
+        c * c * along + s * s * across, c * s * (along - across), along * across
+    )
+    return (sx + r * c, sy + r * s), factor, anchor
+
+
+def log_new_density(sensor, value, params):
+    """log density of measurements of new landmarks: `density_new` per m^2, seen as `value`."""
+    if sensor == "bearing":
+        area = params.view_range**2 / 2 + jnp.zeros_like(value[0])
+    elif sensor == "position":
+        area = jnp.ones_like(value[0])
+    else:
+        area = jnp.maximum(value[0], 1e-6)
+    return jnp.log1p(-params.outlier) + jnp.log(params.density_new * area)
+
+
+def at_most_one_new(params):
+    """The parameters for telling hidden identities apart by bearings alone: no more than one new
+    landmark a frame is expected.
+
+    A bearing has no place. `density_new` over the whole view counts the landmarks that are in the
+    map already, so that where they are dense everything would be new.
+    """
+    width = params.view_max - params.view_min
+    most = 2 / (width * params.view_range**2)
+    return params._replace(density_new=jnp.minimum(params.density_new, most))
+
+
+def log_clutter_density(sensor, params):
+    """log density of measurements of nothing: uniform over the view, with probability `outlier`."""
+    width = params.view_max - params.view_min
+    volume = {
+        "bearing": width,
+        "position": width * params.view_range**2 / 2,
+        "range_bearing": width * params.view_range,
+    }[sensor]
+    return jnp.log(params.outlier) - jnp.log(volume)

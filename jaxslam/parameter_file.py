@@ -1,0 +1,257 @@
+"""Parameter files: TOML, one line per parameter with its unit and meaning.
+
+`name = value  # unit, meaning`, and standard errors, where known, in a table `[standard_error]`. A
+file may hold only some of the names. What is to be learnt, and how, may be told in three tables:
+
+    [learn]
+    parameters = ["err_rot", "sigma_bearing"]
+    [bounds]  # lowest and highest, in the parameter's unit
+    err_rot = [0.01, 1.0]
+    [prior]  # value in its unit; standard deviation of its logarithm (outlier: of its log-odds;
+    err_rot = [0.1, 0.5]  # mount_x, mount_y, mount_yaw, bias_drift: in its unit)
+"""
+
+import math
+import tomllib
+from difflib import get_close_matches
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxslam.config import UNITS, Params
+from jaxslam.files import replacing
+
+MEANING = {
+    "err_tran": "noise along the path, per distance",
+    "err_rot": "noise of the heading, per turn",
+    "err_drift": "noise of the heading, per distance",
+    "floor_tran": "noise of the position, per time",
+    "floor_rot": "noise of the heading, per time",
+    "gain_tran": "true over measured distance",
+    "gain_rot": "true over measured turn",
+    "bias_drift": "systematic turn, per distance",
+    "sigma_range": "noise of a range",
+    "sigma_bearing": "noise of a bearing, far away",
+    "growth": "sideways noise of what is seen: it has a size",
+    "position_scale": "multiplies the standard deviations of positions",
+    "correlation": "path over which errors stay alike",
+    "caution": "bearing noise that the filter adds",
+    "mount_x": "sensor on the robot, forward",
+    "mount_y": "sensor on the robot, left",
+    "mount_yaw": "sensor on the robot, counter-clockwise",
+    "outlier": "that a measurement comes from nothing",
+    "density_new": "landmarks to be expected",
+    "detection": "that a landmark at range 0 is seen",
+    "view_min": "least bearing the sensor sees",
+    "view_max": "largest bearing the sensor sees",
+    "view_range": "largest range the sensor sees",
+    "inv_depth_mean": "inverse depth of a new landmark (bearing only)",
+    "inv_depth_sd": "its standard deviation",
+    "existence_new": "existence of a new landmark",
+    "existence_seen": "added when it is seen",
+    "existence_miss": "weight of not seeing what was expected",
+    "existence_max": "existence at most",
+    "existence_confirm": "from here on it is in the map",
+}
+ABOVE_ZERO = ("gain_tran", "gain_rot", "sigma_range", "sigma_bearing", "position_scale")
+ABOVE_ZERO += ("density_new", "view_range", "inv_depth_mean", "inv_depth_sd", "existence_max")
+AT_LEAST_ZERO = ("err_tran", "err_rot", "err_drift", "floor_tran", "floor_rot", "growth")
+AT_LEAST_ZERO += ("correlation", "caution", "existence_seen", "existence_miss")
+ERRORS = "standard_error"
+LEARN, BOUNDS, PRIOR = "learn", "bounds", "prior"
+PAIRS = {BOUNDS: "[lowest, highest]", PRIOR: "[value, standard deviation]"}
+MAX_BYTES = 1 << 20
+
+
+class Learning(NamedTuple):
+    """What a file says of learning: where to start, which `names` (None: not said), `bounds` and
+    `priors` as pairs by name."""
+
+    params: Params
+    names: tuple | None = None
+    bounds: dict | None = None
+    priors: dict | None = None
+
+
+def validate(params, where):
+    """`params` as floats, once each value is a number in its range.
+
+    `where` begins the message of the `ValueError`: a file's name, for example.
+    """
+    values = {name: _number(where, name, value) for name, value in params._asdict().items()}
+    for name, (good, allowed) in _ranges(values).items():
+        if not good:
+            raise ValueError(f"{where}: {name} is {values[name]:g}; must be {allowed}")
+    return Params(**values)
+
+
+def _ranges(v):
+    """For each bounded name: whether its value is allowed, and what is."""
+    ranges = {name: (v[name] > 0, f"above 0 {UNITS[name]}") for name in ABOVE_ZERO}
+    ranges |= {name: (v[name] >= 0, f"0 {UNITS[name]} or more") for name in AT_LEAST_ZERO}
+    low, high, pi = v["view_min"], v["view_max"], math.pi + 1e-6  # float32 rounds it up
+    most = v["existence_max"]
+    return ranges | {
+        "outlier": (0 <= v["outlier"] < 1, "a probability, from 0 to below 1"),
+        "detection": (0 <= v["detection"] <= 1, "a probability, from 0 to 1"),
+        "view_min": (-pi <= low < high, f"from -pi to below view_max, {high:g} rad"),
+        "view_max": (low < high <= pi, f"above view_min, {low:g} rad, and at most pi"),
+        # Below zero a landmark would be forgotten in the frame it was born in.
+        "existence_new": (0 <= v["existence_new"] <= most, f"from 0 to existence_max, {most:g}"),
+        "existence_confirm": (v["existence_confirm"] <= most, f"at most existence_max, {most:g}"),
+    }
+
+
+def load_params(path, base):
+    """`Params` of a file; names it does not hold keep their value of `base`.
+
+    Raises `ValueError` naming file, name, what was found and what is allowed.
+    """
+    return _load(path, base).params
+
+
+def load_learning(path, base):
+    """`Learning` of a file: as `load_params`, with the tables that a run is not concerned with.
+
+    Raises `ValueError` as that does, and for a start outside its bounds.
+    """
+    found = _load(path, base)
+    for name, (low, high) in found.bounds.items():
+        start = getattr(found.params, name)
+        if not low <= start <= high:
+            told = f"{name} starts at {start:g}, outside its bounds {low:g} to {high:g}"
+            raise ValueError(f"{path}: {told}")
+    return found
+
+
+def _load(path, base):
+    table = _read(Path(path))
+    errors, learn = (_table(path, table, part) for part in (ERRORS, LEARN))
+    pairs = {part: _table(path, table, part) for part in PAIRS}
+    for place, names in (("", table), (f"{ERRORS}.", errors)):
+        for name, value in names.items():
+            _check_name(path, place, name)
+            if _number(path, place + name, value) < 0 and place:
+                raise ValueError(f"{path}: {place}{name} is {value!r}; must be 0 or more")
+    params = validate(base._replace(**table), path)
+    for part, names in pairs.items():
+        for name, value in names.items():
+            _check_name(path, f"{part}.", name)
+            pairs[part] = pairs[part] | {name: _pair(path, part, name, value, params)}
+    return Learning(params, _names(path, learn), pairs[BOUNDS], pairs[PRIOR])
+
+
+def _table(path, table, part):
+    """The table of that name, taken out; empty where there is none."""
+    found = table.pop(part, {})
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: {part} is {found!r}; must be a table, [{part}]")
+    return found
+
+
+def _names(path, learn):
+    """What `[learn]` names, or None."""
+    for key in learn:
+        if key != "parameters":
+            raise ValueError(f"{path}: {LEARN}.{key} is not known; there is: parameters")
+    names = learn.get("parameters")
+    if names is None:
+        return None
+    if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
+        wanted = '["err_rot", "err_drift"]'
+        raise ValueError(f"{path}: {LEARN}.parameters is {names!r}; must be names, like {wanted}")
+    for name in names:
+        _check_name(path, f"{LEARN}.parameters: ", name)
+    if len(set(names)) < len(names):
+        raise ValueError(f"{path}: {LEARN}.parameters names one of {', '.join(names)} twice")
+    return tuple(names)
+
+
+def _pair(path, part, name, value, params):
+    """Two numbers of `[bounds]` or `[prior]`."""
+    where = f"{part}.{name}"
+    if not isinstance(value, list) or len(value) != 2:
+        raise ValueError(f"{path}: {where} is {value!r}; must be {PAIRS[part]}")
+    first, second = (_number(path, where, number) for number in value)
+    in_range = (first, second) if part == BOUNDS else (first,)
+    for number in in_range:
+        good, allowed = _ranges(params._replace(**{name: number})._asdict()).get(name, (True, ""))
+        if not good:
+            raise ValueError(f"{path}: {where} holds {number:g}; must be {allowed}")
+    if part == BOUNDS and not first < second:
+        raise ValueError(f"{path}: {where} is {value}; must be {PAIRS[part]}")
+    if part == PRIOR and second <= 0:
+        raise ValueError(f"{path}: {where}: standard deviation {second:g}; must be above 0")
+    if part == PRIOR and first <= 0 and name in _ranges(params._asdict()):
+        raise ValueError(f"{path}: {where} is about {first:g}, which has no logarithm; above 0")
+    return first, second
+
+
+def save_params(path, params, standard_errors=None, learning=None):
+    """Write `params` to a file, all or nothing; `standard_errors`: a dict by name, or None.
+
+    `learning`: a `Learning` whose names, bounds and priors are written too, so that the file can
+    start another fit.
+
+    Raises `ValueError` when a value is out of range or the place can't be written.
+    """
+    path = Path(path)
+    values = validate(params, path)._asdict()
+    lines = [f"{f'{name} = {value!r}':36}  # {UNITS[name]}, {MEANING[name]}\n"
+             for name, value in values.items()]  # fmt: skip
+    if standard_errors:
+        lines.append(f"\n[{ERRORS}]\n")
+        for name, value in standard_errors.items():
+            _check_name(path, f"{ERRORS}.", name)
+            lines.append(f"{name} = {_number(path, f'{ERRORS}.{name}', value)!r}\n")
+    if learning is not None:
+        lines += _learning_lines(path, learning)
+    with replacing(path) as file:
+        file.write("".join(lines).encode())
+
+
+def _learning_lines(path, learning):
+    """The tables of a `Learning`."""
+    if learning.names is not None:
+        names = ", ".join(f'"{name}"' for name in _names(path, {"parameters": [*learning.names]}))
+        yield f"\n[{LEARN}]\nparameters = [{names}]\n"
+    for part, pairs in ((BOUNDS, learning.bounds or {}), (PRIOR, learning.priors or {})):
+        if pairs:
+            yield f"\n[{part}]  # {PAIRS[part]}\n"
+        for name, pair in pairs.items():
+            _check_name(path, f"{part}.", name)
+            yield f"{name} = {list(_pair(path, part, name, [*pair], learning.params))}\n"
+
+
+def _read(path):
+    try:
+        with open(path, "rb") as file:
+            content = file.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file of parameters") from None
+    except OSError as err:
+        raise ValueError(f"{path}: cannot read ({err.strerror})") from err
+    if len(content) > MAX_BYTES:
+        raise ValueError(f"{path}: over {MAX_BYTES} bytes, so it is no file of parameters")
+    try:
+        return tomllib.loads(content.decode("utf-8"))
+    except ValueError as err:  # also what can't be decoded
+        raise ValueError(f"{path}: not TOML: {err}") from err
+
+
+def _check_name(path, place, name):
+    if name not in Params._fields:
+        near = get_close_matches(name, Params._fields, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(Params._fields)}"
+        raise ValueError(f"{path}: {place}{name} is no parameter; {hint}")
+
+
+def _number(where, name, value):
+    """A finite float of a number or a 0-d array."""
+    try:
+        number = math.nan if isinstance(value, bool | str) else float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        found = (repr(value).splitlines() or [""])[0]
+        raise ValueError(f"{where}: {name} is {found}; must be a finite number")
+    return number

@@ -1,0 +1,294 @@
+"""The filter beside the NumPy baseline, fed the same draws: agreement, accuracy and time.
+
+In float64 both must take every decision alike and differ by rounding only. In float32 a decision
+that is nearly a tie falls differently sooner or later; from there on they are two honest runs.
+"""
+
+import dataclasses
+import time
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.config import Params, default_params
+from jaxslam.filter import step as fastslam
+from jaxslam.filter.frames import frames
+from jaxslam.logs.truth import truth_at, wrap
+from jaxslam.models import geometry
+from jaxslam.reference import ekf
+from jaxslam.reference import fastslam as baseline
+from jaxslam.results.metrics import ate
+
+
+class Agreement(NamedTuple):
+    """Both filters over T steps, N particles.
+
+    `same`: steps, from the first on, with equal ancestors and associations of all particles.
+    Largest absolute differences: of `pose` [m, rad] and `log_weight` over these steps, all
+    particles; of `landmarks` (means and covariances) and `births`, at the end (inf where only one
+    has a landmark; NaN when `same` < T). Counted in the baseline: steps that `resampled`; landmarks
+    `born`, `freed` and lost in `overflow`, per particle; measurements that were `clutter`, per
+    particle. Mean poses [T, 3] and seconds of both, `compile_seconds` apart, and the map of the
+    baseline's best particle.
+    """
+
+    steps: int
+    particles: int
+    same: int
+    pose: float
+    log_weight: float
+    landmarks: float
+    resampled: int
+    born: float
+    freed: float
+    overflow: float
+    clutter: float
+    pose_baseline: np.ndarray
+    pose_filter: np.ndarray
+    seconds_baseline: float
+    seconds_filter: float
+    compile_seconds: float
+    map_baseline: "PointMap"
+
+
+class PointMap(NamedTuple):
+    """World points `mean` [L, 2], m, and the log's `identity` [L] (-1: hidden)."""
+
+    mean: np.ndarray
+    identity: np.ndarray
+
+
+class Comparison(NamedTuple):
+    """One particle count: `double` and `single` precision, and unaligned ATE [m] of both filters
+    in single precision (NaN without truth)."""
+
+    double: Agreement
+    single: Agreement
+    ate_baseline: float
+    ate_filter: float
+
+
+def compare(log, config, params=None, seed=0, steps=200, every=None, progress=None):
+    """`Comparison` over `steps` of the log's frames, every `every`-th from the first on.
+
+    `every`: None to cover a tenth of the log, or as much as there is. `progress`: as for
+    `agreement`, which is run in float64 and in float32. The baseline has no other proposal than
+    the prior and takes no notice of looks, so the filter does as it does.
+    """
+    config = dataclasses.replace(config, proposal="prior", rejuvenate=0.0, descriptors=0)
+    log = select(log, thinned(log, steps, every))
+    double = agreement(log, config, params, seed, steps, True, progress)
+    single = agreement(log, config, params, seed, steps, False, progress)
+    true = truth_at(log.truth, log.frame_time)
+    errors = [ate(p, true, align=False)[0] for p in (single.pose_baseline, single.pose_filter)]
+    return Comparison(double, single, *errors)
+
+
+def thinned(log, steps, every=None):
+    """Numbers of `steps` frames, every `every`-th from the first on (None: over a tenth)."""
+    if every is None:
+        every = max(1, len(log.frame_time) // (10 * steps))
+    return np.arange(0, len(log.frame_time), every)[:steps]
+
+
+def agreement(log, config, params=None, seed=0, steps=None, double=True, progress=None):
+    """`Agreement` over the log's first `steps` frames (None: all).
+
+    `double`: the filter in float64, without changing JAX's global settings; otherwise in float32.
+    The baseline is in float64 always, and gets the filter's draws. `progress`: called with
+    (done, total), first with (0, total) before compiling.
+    """
+    if config.proposal != "prior" or config.association == "sampled":
+        raise ValueError(
+            "compare: the baseline has the prior proposal, and maximum_likelihood or known"
+        )
+    params = default_params(config.sensor, log) if params is None else params
+    params = Params(*map(float, params))
+    if steps is not None:
+        log = select(log, np.arange(min(steps, len(log.frame_time))))
+    data = frames(log, config.sensor, config.measurements, params, config.association == "known")
+    if progress:
+        progress(0, len(data.time))
+    # The runner's local origin: float32 has 7 digits.
+    origin = np.array([*log.start_pose[:2], 0.0])
+    start = log.start_pose - origin
+    with jax.enable_x64(double):
+        state, trace, draws, compiled, ran = _run_filter(data, config, params, seed, start, log)
+    begin = time.perf_counter()
+    reference = baseline.run(
+        data.odometry, data.measurements, params, config, start, log.start_cov, *draws,
+        progress=progress,
+    )  # fmt: skip
+    spent = time.perf_counter() - begin
+    return Agreement(
+        len(data.time),
+        config.particles,
+        *_differences(state, trace, reference),
+        resampled=int(reference.resampled.sum()),
+        born=float(reference.births.sum() / config.particles),
+        freed=float(reference.freed.sum() / config.particles),
+        overflow=float(reference.overflow.sum() / config.particles),
+        clutter=float((reference.match == baseline.CLUTTER).sum() / config.particles),
+        pose_baseline=reference.pose_mean + origin,
+        pose_filter=trace.mean + origin,
+        seconds_baseline=spent,
+        seconds_filter=ran,
+        compile_seconds=compiled,
+        map_baseline=_baseline_map(reference, params, config, data.identities, origin),
+    )
+
+
+def select(log, kept):
+    """The log with only these frames (increasing numbers [F]): a slower sensor, the same drive."""
+    number = np.full(len(log.frame_time), -1)
+    number[kept] = np.arange(len(kept))
+    rows = number[log.frame] >= 0
+    columns = ("bearing", "bearing_sigma", "range", "point", "point_cov", "point_baseline")
+    columns += ("identity", "descriptor")
+    truth = log.truth
+    if truth is not None and truth.identity is not None:
+        truth = dataclasses.replace(truth, identity=truth.identity[rows])
+    return dataclasses.replace(
+        log,
+        frame_time=log.frame_time[kept],
+        frame=number[log.frame[rows]],
+        truth=truth,
+        **{n: getattr(log, n)[rows] for n in columns if getattr(log, n) is not None},
+    )
+
+
+def table(comparisons):
+    """Text: one column per `Comparison`."""
+    rows = [
+        ("", "{0.particles} particles"),
+        ("float64: decisions alike", "{0.same} of {0.steps} steps"),
+        ("  largest difference, poses", "{0.pose:.1e} m, rad"),
+        ("  log weights", "{0.log_weight:.1e}"),
+        ("  landmarks at the end", "{0.landmarks:.1e}"),
+        ("  resampled", "{0.resampled} steps"),
+        ("  landmarks born, forgotten", "{0.born:.1f}, {0.freed:.1f}"),
+        ("float32: decisions alike", "{1.same} of {1.steps} steps"),
+        ("  largest difference, poses", "{1.pose:.1e} m, rad"),
+        ("path error, baseline", "{2.ate_baseline:.3f} m RMSE"),
+        ("path error, filter", "{2.ate_filter:.3f} m RMSE"),
+        ("time per step, baseline", "{3[0]:.4g} ms"),
+        ("  filter, first run, compiling", "{3[1]:.4g} ms"),
+        ("  filter", "{3[2]:.4g} ms"),
+        ("  baseline / filter, compiling", "{3[3]:.4g} times"),
+        ("  baseline / filter", "{3[4]:.4g} times"),
+    ]
+    lines = []
+    for name, cell in rows:
+        cells = [cell.format(row.double, row.single, row, _times(row)) for row in comparisons]
+        lines.append(f"{name:32}" + "".join(f"{text:>20}" for text in cells))
+    return "\n".join(lines)
+
+
+def _times(row):
+    """Milliseconds per step of baseline, compiling filter and filter, and the two ratios."""
+    both = row.double, row.single  # the baseline is the same in both
+    slow = sum(part.seconds_baseline for part in both) / 2
+    fast = row.single.seconds_filter
+    first = fast + row.single.compile_seconds
+    per_step = [1e3 * seconds / row.single.steps for seconds in (slow, first, fast)]
+    return *per_step, slow / first, slow / fast
+
+
+class _Trace(NamedTuple):
+    """Every step's poses [T, 3, N], log weights [T, N], ancestors [T, N], births matched [T, K, N]
+    and mean pose [T, 3]."""
+
+    pose: np.ndarray
+    log_weight: np.ndarray
+    ancestors: np.ndarray
+    birth: np.ndarray
+    mean: np.ndarray
+
+
+@partial(jax.jit, static_argnames="config")
+def _steps(key, state, odometry, measurements, params, config):
+    def body(state, frame):
+        state, info = fastslam.step(key, state, *frame, params, config)
+        kept = state.pose, state.log_weight, info.ancestors, info.birth, info.estimate.mean
+        return state, _Trace(*kept)
+
+    return jax.lax.scan(body, state, (odometry, measurements))
+
+
+def _run_filter(data, config, params, seed, start, log):
+    """Final state, `_Trace`, draws for the baseline, seconds to compile and to run."""
+    key = jax.random.key(seed)
+    state = fastslam.init(config, key, start, log.start_cov)
+    given = jax.tree.map(jnp.asarray, (data.odometry, data.measurements, params))
+    begin = time.perf_counter()
+    steps = _steps.lower(key, state, *given, config).compile()
+    compiled = time.perf_counter()
+    jax.block_until_ready(steps(key, state, *given))  # to warm up
+    begin, compiled = time.perf_counter(), compiled - begin
+    final, trace = jax.block_until_ready(steps(key, state, *given))
+    final = fastslam.settled(final, config)
+    ran = time.perf_counter() - begin
+    numbers = jnp.arange(len(data.time), dtype=jnp.int32)
+    chance = jax.vmap(lambda step: fastslam.draws(key, step, config))(numbers)
+    draws = fastslam.start_draws(key, config), chance.normals, chance.uniform
+    host = [jax.tree.map(np.asarray, tree) for tree in (final, trace, draws)]
+    return *host, compiled, ran
+
+
+def _baseline_map(reference, params, config, identities, origin):
+    """`PointMap` of the best particle's landmarks that are confirmed and have a depth."""
+    # After resampling all weights are equal: the best particle lives on in its first child.
+    heir = int(np.argmax(reference.ancestors[-1] == reference.best[-1]))
+    particle = reference.particles[heir]
+    points, names = [], []
+    for slot, mark in enumerate(particle.landmarks):
+        if mark is None or (config.forgetting and mark.log_odds < params.existence_confirm):
+            continue
+        if config.sensor == "bearing" and not mark.mean[1] > 3 * np.sqrt(mark.cov[1, 1]):
+            continue  # no depth
+        points.append(ekf.point_of(mark, config.sensor)[0] + origin[:2])
+        names.append(identities[slot] if slot < len(identities) else -1)
+    return PointMap(np.reshape(points, (-1, 2)), np.array(names, np.int64))
+
+
+def _differences(state, trace, reference):
+    """`same`, `pose`, `log_weight` and `landmarks` of `Agreement`."""
+    equal = (trace.ancestors == reference.ancestors).all(1)
+    equal &= (np.swapaxes(trace.birth, 1, 2) == reference.birth).all((1, 2))
+    total = len(equal)
+    same = total if equal.all() else int(np.argmin(equal))
+    if same == 0:
+        return 0, np.nan, np.nan, np.nan
+    pose = (trace.pose - reference.poses)[:same]
+    pose[:, 2] = wrap(pose[:, 2])
+    weight, other = trace.log_weight[:same], reference.log_weight[:same]
+    apart = np.zeros(weight.shape)  # also where both are -inf
+    np.subtract(weight, other, out=apart, where=weight != other)
+    far = _map_difference(state.landmarks, reference.particles) if same == total else np.nan
+    return same, float(np.abs(pose).max()), float(np.abs(apart).max()), far
+
+
+def _map_difference(world, particles):
+    """Largest difference of any number of any landmark of any particle; inf: not the same ones."""
+    cov = np.stack(geometry.covariance(world.factor.astype(float)))
+    largest = 0.0
+    for i, particle in enumerate(particles):
+        marks = sorted((m for m in particle.landmarks if m is not None), key=lambda m: m.birth)
+        slots = np.flatnonzero(world.count[:, i])
+        slots = slots[np.argsort(world.birth[slots, i])]
+        births = [(m.birth, m.count) for m in marks]
+        if births != list(zip(world.birth[slots, i], world.count[slots, i], strict=True)):
+            return np.inf
+        for slot, landmark in zip(slots, marks, strict=True):
+            (xx, xy), (_, yy) = landmark.cov
+            pairs = [(world.mean, landmark.mean), (cov, (xx, xy, yy))]
+            pairs += [(world.anchor, landmark.anchor)] if world.anchor is not None else []
+            pairs += (
+                [(world.log_odds[None], landmark.log_odds)] if world.log_odds is not None else []
+            )
+            for mine, other in pairs:
+                largest = max(largest, float(np.abs(mine[:, slot, i] - other).max()))
+    return largest

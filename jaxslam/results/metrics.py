@@ -1,0 +1,290 @@
+"""How wrong a run was: path, map, pose consistency and association against the log's truth.
+
+NumPy, float64, on the host. Poses are (x, y, heading) in the world's frame, metres and radians.
+The start pose is given to the filter, so that unaligned errors mean something; both are reported.
+"""
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.stats import chi2
+
+from jaxslam.logs.truth import truth_at, wrap
+
+GATE = 0.5  # m, the widest gate within which a landmark may be called found
+
+
+def align_se2(estimate, truth):
+    """The motion (x, y, yaw) that carries `estimate` [T, 2] onto `truth` [T, 2] in least squares.
+
+    Umeyama, "Least-squares estimation of transformation parameters between two point patterns"
+    (PAMI 1991), without scale; in the plane its rotation is a single arctangent.
+    """
+    centre_e, centre_t = estimate.mean(0), truth.mean(0)
+    e, t = estimate - centre_e, truth - centre_t
+    yaw = np.arctan2((e[:, 0] * t[:, 1] - e[:, 1] * t[:, 0]).sum(), (e * t).sum())
+    shift = centre_t - apply_se2((0.0, 0.0, yaw), centre_e)
+    return np.array([*shift, yaw])
+
+
+def apply_se2(motion, points):
+    """Points [..., 2] after the motion (x, y, yaw)."""
+    x, y, yaw = motion
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.asarray(points) @ np.array([[c, s], [-s, c]]) + np.array([x, y])
+
+
+def with_truth(truth):
+    """Which rows [T] of a true path [T, 2 or 3] have a position."""
+    return np.isfinite(truth[:, :2]).all(1)
+
+
+def ate(estimate, truth, align=True):
+    """Absolute trajectory error (RMSE, maximum) in metres over the rows that have truth.
+
+    `estimate`, `truth`: [T, 2 or 3]. With `align` after the best rigid motion, which needs three
+    positions that are not one place; (NaN, NaN) where it can't be computed.
+    """
+    have = with_truth(truth)
+    estimate, truth = estimate[have, :2], truth[have, :2]
+    if not have.any() or (align and not alignable(truth)):
+        return np.nan, np.nan
+    if align:
+        estimate = apply_se2(align_se2(estimate, truth), estimate)
+    distance = np.hypot(*(estimate - truth).T)
+    return float(np.sqrt(np.mean(distance**2))), float(distance.max())
+
+
+def alignable(points):
+    """Whether points [T, 2] determine a rigid motion that is more than an exact fit."""
+    return len(points) >= 3 and bool(np.ptp(points, 0).max() > 1e-6)
+
+
+def rpe(estimate, truth, distance=1.0, time=None, seconds=None):
+    """Relative pose error (m, rad), RMSE over pieces of the path [T, 3] of one length.
+
+    Pieces are `distance` metres along the true path or, with `time` (int64 ns) and `seconds`, of
+    that duration; they start every tenth of it, so that standing still does not weigh more. A piece
+    over a fifth too long (truth was missing) is left out. (NaN, NaN) without pieces.
+    """
+    have = np.isfinite(truth).all(1)
+    estimate, truth = estimate[have, :3], truth[have]
+    if have.sum() < 2:
+        return np.nan, np.nan
+    if seconds is None:
+        length = distance
+        along = np.append(0.0, np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T)))
+    else:
+        length, along = seconds, (time[have] - time[have][0]) / 1e9
+    start = np.unique(np.searchsorted(along, np.arange(0.0, along[-1], length / 10)))
+    end = np.searchsorted(along, along[start] + length * (1 - 1e-9))
+    start, end = start[end < along.size], end[end < along.size]
+    good = along[end] - along[start] <= 1.2 * length
+    start, end = start[good], end[good]
+    if start.size == 0:
+        return np.nan, np.nan
+    move_e, move_t = between(estimate[start], estimate[end]), between(truth[start], truth[end])
+    error = move_e - move_t
+    error[:, 2] = wrap(error[:, 2])
+    return (
+        float(np.sqrt(np.mean((error[:, :2] ** 2).sum(1)))),
+        float(np.sqrt(np.mean(error[:, 2] ** 2))),
+    )
+
+
+def between(a, b):
+    """Pose b [T, 3] seen from pose a [T, 3]."""
+    dx, dy = (b - a)[:, 0], (b - a)[:, 1]
+    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+    return np.stack([c * dx + s * dy, c * dy - s * dx, wrap(b[:, 2] - a[:, 2])], 1)
+
+
+def nees(pose, cov, truth, resolution=0.0):
+    """Normalised estimation error squared [T] of poses [T, 3] with covariances [T, 3, 3].
+
+    Chi-squared with 3 degrees of freedom when the filter is consistent. NaN where there is no truth
+    or the covariance is singular. Truth read to `resolution` metres adds the variance of rounding.
+    """
+    cov = np.asarray(cov, float) + np.diag([resolution**2 / 12, resolution**2 / 12, 0.0])
+    error = pose - truth
+    error[:, 2] = wrap(error[:, 2])
+    sd = np.sqrt(np.einsum("tii->ti", cov))
+    result = np.full(len(pose), np.nan)
+    # Scaled to correlations, so that metres and radians are alike and "singular" has one meaning.
+    good = np.isfinite(error).all(1) & np.isfinite(cov).all((1, 2)) & (sd > 0).all(1)
+    z = error[good] / sd[good]
+    correlation = cov[good] / (sd[good][:, :, None] * sd[good][:, None, :])
+    regular = np.linalg.det(correlation) > 1e-9
+    solved = np.linalg.solve(correlation[regular], z[regular][:, :, None])[:, :, 0]
+    result[np.flatnonzero(good)[regular]] = (z[regular] * solved).sum(1)
+    return result
+
+
+def landmark_gate(landmarks):
+    """min(0.5 m, half the smallest spacing of the true landmarks [L, 2])."""
+    gap = np.hypot(*(landmarks[:, None] - landmarks[None]).transpose(2, 0, 1))
+    return float(min(GATE, np.where(gap > 0, gap, np.inf).min(initial=np.inf) / 2))
+
+
+def pair_by_identity(identity, landmark_id):
+    """Rows (estimated, true) that bear the same identity; the first estimate of each counts."""
+    first = {int(who): row for row, who in reversed(list(enumerate(identity))) if who >= 0}
+    pairs = [(first[int(who)], row) for row, who in enumerate(landmark_id) if int(who) in first]
+    return np.array(pairs, int).reshape(-1, 2)
+
+
+def pair_by_distance(mean, landmarks, gate):
+    """Rows (estimated, true) of the best one-to-one pairing of points within `gate` metres."""
+    if len(mean) == 0 or len(landmarks) == 0:
+        return np.zeros((0, 2), int)
+    gap = np.hypot(*(mean[:, None] - landmarks[None]).transpose(2, 0, 1))
+    near = gap <= gate
+    # A pair outside the gate costs more than all pairs inside together.
+    cost = np.where(near, gap**2, (1 + min(gap.shape)) * max(gate, 1e-9) ** 2)
+    rows, columns = linear_sum_assignment(cost)
+    return np.stack([rows, columns], 1)[near[rows, columns]]
+
+
+def map_error(mean, identity, truth, motion=None):
+    """Errors of a map [L, 2] against the true landmarks: rmse_m, matched, missed, spurious, gate_m.
+
+    Known identities (any >= 0, and named in the truth) pair by identity, ungated: no gate_m. Hidden
+    ones pair one-to-one within the gate. `motion`: an alignment (x, y, yaw) applied first.
+    """
+    landmarks = np.asarray(truth.landmarks, float)
+    mean = np.asarray(mean, float).reshape(-1, 2)
+    if motion is not None:
+        mean = apply_se2(motion, mean)
+    known = truth.landmark_id is not None and (np.asarray(identity) >= 0).any()
+    gate = None if known else landmark_gate(landmarks)
+    pairs = (
+        pair_by_identity(identity, truth.landmark_id)
+        if known
+        else pair_by_distance(mean, landmarks, gate)
+    )
+    found = dict(
+        matched=len(pairs), missed=len(landmarks) - len(pairs), spurious=len(mean) - len(pairs)
+    )
+    if len(pairs):
+        error = mean[pairs[:, 0]] - landmarks[pairs[:, 1]]
+        found["rmse_m"] = float(np.sqrt(np.mean((error**2).sum(1))))
+    return found if known else found | {"gate_m": gate}
+
+
+def association_accuracy(result, log=None, match=None):
+    """The share of measurements of known origin that were told apart rightly; NaN if there is none.
+
+    A match is right if the measurement that created the landmark was of the same true landmark,
+    "new" if no measurement of that landmark was called new before, "clutter" if it was clutter (a
+    true identity of -1). Without true identities the measured ones serve, and -1 does not count.
+    `match` [T, K]: None for the filter's.
+    """
+    log = result.log if log is None else log
+    identity = None if log.truth is None else log.truth.identity
+    clutter_known = identity is not None
+    identity = log.identity if identity is None else identity
+    if identity is None or len(identity) == 0:
+        return np.nan
+    row = np.asarray(result.row).ravel()
+    match = np.asarray(result.match if match is None else match).ravel()
+    who = np.where(row >= 0, np.asarray(identity)[row.clip(0)], -1)
+    counted = (match >= -2) & (row >= 0) & ((who >= 0) | clutter_known)
+    # A landmark's label is the place (frame * K + k) of the measurement that created it.
+    right = (match >= 0) & (who >= 0) & (who[match.clip(0)] == who)
+    new = np.flatnonzero((match == -1) & (row >= 0) & (who >= 0))
+    right[new[np.unique(who[new], return_index=True)[1]]] = True
+    right |= (match == -2) & (who < 0)
+    return float(right[counted].mean()) if counted.any() else np.nan
+
+
+def errors(result, log=None):
+    """The errors of a run for `summary.json`; a key is absent where it can't be computed.
+
+    Empty without truth. `log` (default: the result's own) is where the truth comes from.
+    """
+    log = result.log if log is None else log
+    found = {"association_accuracy": association_accuracy(result, log)}
+    if result.refined is not None:
+        again = association_accuracy(result, log, result.refined.match)
+        found["association_accuracy_refined"] = again
+    if log.truth is not None:
+        true = truth_at(log.truth, result.time)
+        if with_truth(true).any():
+            found |= path_errors(result, true, log.truth.resolution)
+        if log.truth.landmarks is not None and len(log.truth.landmarks):
+            found |= landmark_errors(result, log.truth, true)
+    return {key: value for key, value in found.items() if np.isfinite(value)}
+
+
+def paths(result):
+    """The paths [T, 3] that a run has, by name: filtered, ancestral, refined, dead_reckoning."""
+    found = {"filtered": result.pose}
+    for name in ("ancestral", "refined"):
+        if getattr(result, name) is not None:
+            found[name] = getattr(result, name).pose
+    return found | {"dead_reckoning": result.dead_reckoning}
+
+
+def path_errors(result, true, resolution):
+    """The part of `errors` that needs true poses [T, 3]."""
+    found = {"truth_frames": int(with_truth(true).sum())}
+    if resolution > 0.1:  # coarser truth says nothing about one metre
+        found["truth_resolution_m"] = float(resolution)
+    for name, path in paths(result).items():
+        found |= _path_errors(name, path, true, resolution)
+    found |= _consistency("nees", result.pose, result.cov, true, resolution)
+    if result.refined is not None:
+        refined = result.refined
+        found |= _consistency("nees_refined", refined.pose, refined.cov, true, resolution)
+    return found
+
+
+def _path_errors(name, path, true, resolution):
+    """Of one path [T, 3]; the names are those of summary.json."""
+    ours = name != "dead_reckoning"
+    (rmse, most), unaligned = ate(path, true), ate(path, true, align=False)
+    ate_name = f"ate_{name}" if ours else f"{name}_ate"
+    found = {f"{ate_name}_rmse_m" if ours else f"{ate_name}_m": rmse, f"{ate_name}_max_m": most}
+    found[f"{ate_name}_unaligned_rmse_m"], found[f"{ate_name}_unaligned_max_m"] = unaligned
+    last = np.flatnonzero(with_truth(true))[-1]
+    found[f"{name}_end_m"] = float(np.hypot(*(path - true)[last, :2]))
+    heading = wrap(path[:, 2] - true[:, 2])
+    if ours and np.isfinite(heading).any():
+        found[f"heading_{name}_rmse_rad"] = float(np.sqrt(np.nanmean(heading**2)))
+    if resolution <= 0.1:
+        kind = "" if name == "filtered" else f"{name}_"
+        found[f"{kind}rpe_1m_m"], found[f"{kind}rpe_1m_rad"] = rpe(path, true)
+    return found
+
+
+def _consistency(name, pose, cov, true, resolution):
+    squared = nees(pose, cov, true, resolution)
+    squared = squared[np.isfinite(squared)]
+    if not squared.size:
+        return {}
+    within = float(np.mean(squared <= chi2.ppf(0.99, 3)))
+    return {f"{name}_median": float(np.median(squared)), f"{name}_within_99": within}
+
+
+def landmark_errors(result, truth, true):
+    """The part of `errors` that needs true landmarks; each map aligned as its path [T, 3] is."""
+    found = _landmark_errors("filtered", "landmarks", result.pose, result.landmarks, truth, true)
+    if result.refined is not None:
+        path, world = result.refined.pose, result.landmarks_refined
+        found |= _landmark_errors("refined", "landmarks_refined", path, world, truth, true)
+    return found
+
+
+def _landmark_errors(name, counts, path, landmarks, truth, true):
+    """Of one map, whose path is [T, 3]."""
+    have = with_truth(true)
+    kinds = {"_unaligned": None}
+    if alignable(true[have, :2]):
+        kinds[""] = align_se2(path[have, :2], true[have, :2])
+    found = {}
+    for kind, motion in kinds.items():
+        error = map_error(landmarks.mean, landmarks.identity, truth, motion)
+        found[f"landmark_{name}{kind}_rmse_m"] = error.get("rmse_m", np.nan)
+        found["landmark_gate_m"] = error.get("gate_m", np.nan)
+        for how in ("matched", "missed", "spurious"):
+            found[f"{counts}{kind}_{how}"] = error[how]
+    return found

@@ -1,0 +1,383 @@
+"""A run's folder: written whole or not at all, and read back.
+
+A long run's folder (`offline`) is there from its beginning; `summary.json` is the last to appear.
+
+`run.toml` reruns it, `summary.json` sums it up, `events.jsonl` says when something happened,
+`steps.npz` holds every column of the result. For other tools: `trajectory.tum` and `landmarks.csv`
+are the filter's, as it knew them at the time and at the end; `trajectory_refined.tum` and
+`landmarks_refined.csv` are what was refined afterwards, and are not there if nothing was.
+"""
+
+import json
+import os
+import shutil
+import tomllib
+import zlib
+from importlib.metadata import PackageNotFoundError, version
+from math import cos, isfinite, sin
+from numbers import Integral
+from pathlib import Path
+from platform import python_version
+from zipfile import BadZipFile
+
+import numpy as np
+
+from jaxslam.config import Config, Params
+from jaxslam.files import NO_SPACE, beside, move_folder, sync
+from jaxslam.logs.log import BUNDLED, load_log, save_log
+from jaxslam.results import figures as plot
+from jaxslam.results import run_lock
+from jaxslam.results.events import ambiguous, events
+from jaxslam.results.metrics import errors
+
+COLUMNS = (
+    *("time", "pose", "cov", "ess", "resampled", "new", "overflow", "outliers", "forgotten"),
+    *("log_evidence", "nonfinite", "degenerate", "match", "row", "dead_reckoning"),
+)
+NEEDED = ("run.toml", "summary.json", "steps.npz")  # without these it is no run's folder
+FINISHED = "summary.json"
+CHECKPOINTS, PARTIAL = "checkpoints", ".results"
+WORKING = (run_lock.NAME, CHECKPOINTS, PARTIAL)  # what only an unfinished run's folder holds
+MAYBE = ("entropy", "events")  # columns that not every run has
+LOOKING_BACK = ("ancestral", "lineage", "refined")  # columns of what a run need not have
+FILES = (
+    *(*NEEDED, "trajectory.tum", "landmarks.csv", "events.jsonl", "log.npz", *plot.FIGURES),
+    *("trajectory_refined.tum", "landmarks_refined.csv"),
+)
+
+
+def save(result, directory, overwrite=False, log_source=None, figures=True):
+    """Write a run's folder; all of it appears at once, or nothing does.
+
+    `log_source`: the path or name the log was loaded from, for reruns; without one the log itself
+    is stored beside the results. Raises `ValueError` for a folder that exists (unless `overwrite`
+    and it is a run's folder) or that can't be written.
+    """
+    directory = Path(directory)
+    check_target(directory, overwrite)
+    target = directory.resolve()
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        partial = beside(target)
+        partial.mkdir()
+    except OSError as error:
+        raise _unwritable(directory, error) from error
+    try:
+        _write_files(result, partial, _source(log_source, target), figures)
+        move_folder(partial, target, overwrite)
+    except OSError as error:
+        raise _unwritable(directory, error) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def finish(result, directory, log_source=None):
+    """Write the results of a long run into its folder: `save` for a folder that is there.
+
+    Dying before `summary.json`, the last, is there leaves it unfinished. Raises `OSError` where
+    there is no space.
+    """
+    directory = Path(directory)
+    partial = directory / PARTIAL
+    clear_results(directory)
+    try:
+        partial.mkdir()
+        _write_files(result, partial, _source(log_source, directory.resolve()))
+        for path in sorted(partial.iterdir(), key=lambda path: path.name == FINISHED):
+            if path.name == FINISHED:
+                sync(directory)
+            os.replace(path, directory / path.name)
+        sync(directory)
+    except OSError as error:
+        raise _unwritable(directory, error) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def clear_results(directory):
+    """Remove a run's results, whole or in part; first the file that says they are whole."""
+    shutil.rmtree(directory / PARTIAL, ignore_errors=True)
+    for name in (FINISHED, *FILES):
+        (directory / name).unlink(missing_ok=True)
+
+
+def check_target(directory, overwrite=False, resume=False):
+    """Raise `ValueError` if a run's folder can't be written here; to be asked before a long run.
+
+    `resume`: there may be an unfinished run, or a finished one. Raises `BlockingIOError` if another
+    process is writing there.
+    """
+    directory = Path(directory)
+    try:
+        if directory.exists() or directory.is_symlink():
+            run_lock.check(directory)
+            _check_existing(directory, overwrite, resume)
+        parent = next(path for path in directory.resolve().parents if path.exists())
+        if not parent.is_dir() or not os.access(parent, os.W_OK):
+            raise ValueError(f"{directory}: can't be made in {parent}; choose another with --out")
+    except BlockingIOError:
+        raise
+    except OSError as error:
+        raise _unwritable(directory, error) from error
+
+
+def _check_existing(directory, overwrite, resume):
+    if not directory.is_dir():
+        raise ValueError(f"{directory}: is not a folder; choose another with --out")
+    names = {path.name for path in directory.iterdir()}
+    unfinished = FINISHED not in names and not names.isdisjoint(WORKING)
+    a_runs = unfinished or not names or names.issuperset(NEEDED)
+    if resume and a_runs:
+        return
+    if resume:
+        raise ValueError(f"{directory}: is not a run's folder, so there is nothing to go on with")
+    if unfinished and not overwrite:
+        raise ValueError(f"{directory}: a run is unfinished; add --resume, or --overwrite")
+    if not overwrite:
+        raise ValueError(f"{directory}: exists; choose another folder or add --overwrite")
+    if not a_runs:
+        raise ValueError(f"{directory}: is not a run's folder, so it is not overwritten")
+    if strange := sorted(names - {*FILES, *WORKING}):
+        raise ValueError(f"{directory}: holds {strange[0]}, not of a run, so it is not overwritten")
+
+
+def load(directory, log=None):
+    """The `Result` saved in a run's folder. `log`: where its log is now, if it was moved.
+
+    Raises `ValueError` if a file is missing or broken, or if the log isn't the run's.
+    """
+    from jaxslam.results.result import MapEstimate, Result  # here, since results save themselves
+
+    directory = Path(directory)
+    try:
+        told = tomllib.loads((directory / "run.toml").read_text(encoding="utf-8"))
+        config, params = Config(**told["config"]), Params(**told["params"])
+        summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
+        with (
+            open(directory / "steps.npz", "rb") as file,
+            np.load(file, allow_pickle=False) as steps,
+        ):
+            columns = {name: steps[name] for name in COLUMNS}
+            landmarks = MapEstimate(**_part("map", steps))
+            columns |= _looking_back(steps)
+            columns |= {name: steps[name] for name in MAYBE if name in steps.files}
+        seed, source = told["seed"], told["log"]
+        spent = {name: summary[name] for name in ("seconds", "compile_seconds", "dropped")}
+        spent["refine_seconds"] = summary.get("refine_seconds")
+    except FileNotFoundError as error:
+        raise ValueError(
+            f"{directory}: no {Path(error.filename).name}; not a run's folder"
+        ) from None
+    except (OSError, KeyError, TypeError, ValueError, EOFError, BadZipFile, zlib.error) as error:
+        raise ValueError(f"{directory}: a broken run's folder ({error}); run it again") from error
+    log = _find_log(directory, source) if log is None else load_log(log)
+    if not np.isin(columns["time"], log.frame_time).all():
+        raise ValueError(f"{directory}: {log.name} is not the log of this run (frame times differ)")
+    return Result(
+        log=log,
+        config=config,
+        params=params,
+        seed=seed,
+        landmarks=landmarks,
+        **columns,
+        **spent,
+    )
+
+
+def _part(name, steps):
+    """The columns of `steps.npz` whose names begin so, without that; numbers as numbers."""
+    begin = f"{name}_"
+    columns = {key[len(begin) :]: steps[key] for key in steps.files if key.startswith(begin)}
+    return {key: value if value.ndim else value.item() for key, value in columns.items()}
+
+
+def _looking_back(steps):
+    """What a run found out looking back, as far as it is there: older folders have none of it."""
+    from jaxslam.smoother.genealogy import Ancestral, Lineage
+
+    found = {name: _part(name, steps) for name in LOOKING_BACK}
+    kinds = {"ancestral": Ancestral, "lineage": Lineage}
+    if found["refined"]:
+        from jaxslam.smoother.refine import Refined  # brings JAX, which nothing else here needs
+
+        kinds["refined"] = Refined
+    return {name: kind(**found[name]) for name, kind in kinds.items() if found[name]}
+
+
+def evaluate_folder(directory, log=None):
+    """The errors of a saved run, computed anew from its columns and its log's truth."""
+    return errors(load(directory, log))
+
+
+def summarise(result):
+    """`summary.json` as a dict: sizes, times, evidence, warnings, versions and the errors."""
+    config = result.config
+    return {
+        "log": result.log.name,
+        "sensor": config.sensor,
+        "association": config.association,
+        "proposal": config.proposal,
+        "descriptors": config.descriptors,
+        "seed": result.seed,
+        "n_particles": config.particles,
+        "n_steps": len(result.time),
+        "n_measurements": int((np.asarray(result.row) >= 0).sum()),
+        "seconds": result.seconds,
+        "compile_seconds": result.compile_seconds,
+        "log_likelihood": float(result.log_likelihood),
+        "n_landmarks": len(result.landmarks.mean),
+        "min_ess": float(np.min(result.ess)) if len(result.ess) else None,
+        "overflow": float(np.sum(result.overflow)),
+        "dropped_measurements": int(sum(result.dropped.values())),
+        "dropped": dict(result.dropped),
+        "ambiguous_measurements": len(ambiguous(result)),
+        "warnings": list(result.flags),
+        "advice": list(result.advice),
+        **_looked_back(result),
+        "versions": versions(),
+        **errors(result),
+    }
+
+
+def _looked_back(result):
+    """The part of `summarise` about the genealogy and the refinement; without them, empty."""
+    told = {}
+    if result.ancestral is not None:
+        told["least_ancestors"] = int(np.min(result.ancestral.distinct, initial=2**31))
+    if result.refine_seconds is not None:
+        told["refine_seconds"] = result.refine_seconds
+    if (found := result.refined) is not None:
+        told |= {
+            "refine_rounds": int(found.rounds),
+            "refine_converged": bool(found.converged),
+            "n_landmarks_refined": len(found.mean),
+        }
+    return told
+
+
+def versions():
+    """Versions of what computed the run."""
+    found = {"python": python_version()}
+    for package in ("jaxslam", "jax", "numpy"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def tum_lines(time, pose):
+    """Lines `t x y z qx qy qz qw`: seconds exact to the nanosecond, metres, unit quaternion.
+
+    `time` int64 ns [T], `pose` [T, 3]. Digits only, since not every reader takes exponents.
+    """
+    for stamp, (x, y, heading) in zip(np.asarray(time).tolist(), pose, strict=True):
+        sign, (second, nano) = "-" * (stamp < 0), divmod(abs(stamp), 10**9)
+        turn = f"{sin(heading / 2):.9f} {cos(heading / 2):.9f}"
+        yield f"{sign}{second}.{nano:09d} {x:.9f} {y:.9f} 0 0 0 {turn}\n"
+
+
+def landmark_lines(landmarks):
+    """The lines of `landmarks.csv`; numbers with all their digits."""
+    yield "id,x,y,sxx,sxy,syy,n\n"
+    for who, mean, cov, n in zip(
+        landmarks.id, landmarks.mean, landmarks.cov, landmarks.n, strict=True
+    ):
+        numbers = ",".join(repr(float(value)) for value in (*mean, *cov))
+        yield f"{int(who)},{numbers},{int(n)}\n"
+
+
+def run_toml(result, log):
+    """The text of `run.toml`: what the run was told, every value resolved."""
+    lines = [
+        f"name = {_toml(result.log.name)}",
+        f"log = {_toml(log)}  # path (from this folder) or name",
+        f"seed = {_toml(result.seed)}",
+    ]
+    lines += ["", "[config]", *_toml_table(vars(result.config))]
+    lines += ["", "[params]  # SI units, radians", *_toml_table(result.params._asdict())]
+    return "\n".join(lines) + "\n"
+
+
+def _write_files(result, folder, source, figures=True):
+    """Write all files of a run into a folder, and see them onto the disk."""
+    if source is None:
+        save_log(folder / "log.npz", result.log)
+        source = "log.npz"
+    columns = {name: np.asarray(getattr(result, name)) for name in COLUMNS}
+    tables = {"map": result.landmarks} | {name: getattr(result, name) for name in LOOKING_BACK}
+    for name, table in tables.items():
+        if table is not None:
+            columns |= {f"{name}_{key}": np.asarray(v) for key, v in table._asdict().items()}
+    maybe = {name: getattr(result, name) for name in MAYBE}
+    columns |= {name: value for name, value in maybe.items() if value is not None}
+    np.savez_compressed(folder / "steps.npz", **columns)
+    files = {
+        "run.toml": [run_toml(result, source)],
+        "trajectory.tum": tum_lines(result.time, result.pose),
+        "landmarks.csv": landmark_lines(result.landmarks),
+        "events.jsonl": (_json(event) + "\n" for event in events(result)),
+        "summary.json": [_json(summarise(result), indent=2) + "\n"],
+    }
+    if result.refined is not None:
+        files["trajectory_refined.tum"] = tum_lines(result.time, result.refined.pose)
+        files["landmarks_refined.csv"] = landmark_lines(result.landmarks_refined)
+    for name, lines in files.items():
+        with open(folder / name, "w", encoding="utf-8", newline="\n") as file:
+            file.writelines(lines)
+    if figures:
+        plot.plot(result, folder)
+    sync(*folder.iterdir(), folder)
+
+
+def _source(log_source, target):
+    """What run.toml calls the log: a bundled name or a path; None: keep a copy of it."""
+    if log_source is None or (str(log_source) in BUNDLED and not Path(log_source).exists()):
+        return log_source
+    path = Path(log_source).resolve()
+    # A log inside the folder that is being replaced would go with it.
+    return None if path.is_relative_to(target) else str(path)
+
+
+def _find_log(directory, source):
+    try:
+        return load_log(source if source in BUNDLED else directory / source)
+    except ValueError as error:
+        raise ValueError(f"{error}; it is the log of {directory}: say --log PATH") from error
+
+
+def _unwritable(directory, error):
+    """The error to raise instead."""
+    if error.errno in NO_SPACE:
+        return OSError(error.errno, error.strerror, str(directory))
+    return ValueError(
+        f"{directory}: can't be written ({error.strerror}); choose another with --out"
+    )
+
+
+def _toml(value):
+    """A value as TOML: text, truth, whole number or float."""
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(int(value) if isinstance(value, Integral) else float(value))
+
+
+def _toml_table(values):
+    return [f"{name} = {_toml(value)}" for name, value in values.items()]
+
+
+def _json(value, indent=None):
+    """JSON text; numbers that are not finite, which JSON lacks, become null."""
+    return json.dumps(_finite(value), indent=indent, ensure_ascii=False, allow_nan=False)
+
+
+def _finite(value):
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not isfinite(value) else value
