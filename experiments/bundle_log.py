@@ -8,7 +8,7 @@ import dataclasses
 import sys
 from pathlib import Path
 
-from jaxslam.logs.log import save_log
+from jaxslam.logs.log_file import save_log
 from jaxslam.logs.readers.aer1513 import read_mat
 
 TARGET = Path(__file__).parents[1] / "jaxslam" / "data" / "lost-in-the-woods.npz"

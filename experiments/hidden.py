@@ -25,7 +25,7 @@ import worlds
 from real_logs import MRCLAM_BATCH
 
 from jaxslam import config_for, default_params, load_log, run
-from jaxslam.results.ambiguity import UNSURE
+from jaxslam.results.events import UNSURE
 from jaxslam.results.metrics import errors
 
 RESULTS = Path(__file__).parent / "results"

@@ -17,7 +17,7 @@ from collections import Counter
 from hashlib import sha256
 from pathlib import Path
 
-from jaxslam.logs.log import save_log
+from jaxslam.logs.log_file import save_log
 from jaxslam.simulation.planar import planar
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -32,7 +32,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from jaxslam.config import Config, Params, default_params
-from jaxslam.filter import landmarks as maps
+from jaxslam.filter import map_estimate
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.frames import frames
 from jaxslam.logs.truth import wrap
@@ -201,7 +201,7 @@ def one_refined(given, config, seed):
     )  # fmt: skip
     end = time.perf_counter()
     numbers = jax.tree.map(jnp.asarray, Params(*map(float, params)))
-    table = maps.summarise(
+    table = map_estimate.summarise(
         fastslam.settled(state, config).landmarks, jnp.exp(state.log_weight), best, numbers, config
     )
     table = jax.tree.map(np.asarray, table)

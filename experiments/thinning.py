@@ -7,7 +7,8 @@ makes these the same model, so the mean log evidence must agree within its sprea
 To first order, that is: where the robot turns far in one interval (0.6 rad here) on large heading
 noise, one step has no shortening of the chord and no spread along it, which many steps do have.
 With `err_rot` alone that is 0.3 nats in 30 s (z = 6 over 60 seeds): one spread of a single run.
-Writes experiments/results/thinning.json and .md. tests/test_thinning.py does a small part of it.
+Writes experiments/results/thinning.json and .md.
+tests/experiments/test_thinning.py does a small part of it.
 """
 
 import dataclasses

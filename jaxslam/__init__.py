@@ -19,11 +19,11 @@ _WHERE = {
     "Log": "logs.log",
     "Truth": "logs.log",
     "FloorPlan": "logs.log",
-    "load_log": "logs.log",
+    "load_log": "logs.log_file",
     "cut": "logs.slicing",
     "windows": "logs.slicing",
     "spaced": "logs.slicing",
-    "save_log": "logs.log",
+    "save_log": "logs.log_file",
     "read": "logs.readers",
     "config_for": "runs.run",
     "run": "runs.run",
@@ -39,7 +39,7 @@ _WHERE = {
     "save_camera": "vision.camera_files",
     "extract_lines": "vision.lines",
     "extract": "vision.extract",
-    "triangulate_log": "vision.points",
+    "triangulate_log": "vision.log_triangulation",
     "render_room": "simulation.room.render",
 }
 _MODULES = {

@@ -129,7 +129,7 @@ def sensor(
     """
     from calibration import sensor_report
     from jaxslam.config import default_params
-    from jaxslam.logs.log import load_log
+    from jaxslam.logs.log_file import load_log
     from jaxslam.parameter_file import save_params
 
     check_new(out, overwrite, "a file of parameters", ".toml")
@@ -208,7 +208,7 @@ def triangulate(
     Example: jaxslam triangulate lost-in-the-woods OUT.npz
     """
     from jaxslam.config import default_params
-    from jaxslam.logs.log import load_log, save_log
+    from jaxslam.logs.log_file import load_log, save_log
     from jaxslam.parameter_file import load_params
     from jaxslam.vision.log_triangulation import triangulate_log
 

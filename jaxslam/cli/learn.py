@@ -152,7 +152,7 @@ def _use_all_cores():
 def _windows(names, start, end, seconds, spacing, known):
     """The parts of the logs, in windows; those without identities left out where these are needed
     and the log has some."""
-    from jaxslam.logs.log import load_log
+    from jaxslam.logs.log_file import load_log
     from jaxslam.logs.slicing import cut, spaced, windows
 
     parts = []

@@ -130,7 +130,7 @@ def run(
     if place and place.process:
         supervisor.go_on_watched()
     with bar("reading", shown=place is None or place.process == 0):
-        from jaxslam.logs.log import load_log
+        from jaxslam.logs.log_file import load_log
         from jaxslam.logs.slicing import cut
 
         loaded, part = load_log(log), bool(start) or end is not None
@@ -184,7 +184,7 @@ def compare(
     """
     counts = _counts(particles)
     with bar("reading"):
-        from jaxslam.logs.log import load_log
+        from jaxslam.logs.log_file import load_log
         from jaxslam.reference import compare as sides
 
         loaded = load_log(log)
@@ -223,7 +223,8 @@ def convert(
     Example: jaxslam convert odometry.csv measurements.csv OUT.npz
     """
     from jaxslam.logs.clock_offset import moved
-    from jaxslam.logs.log import NOT_USED, save_log
+    from jaxslam.logs.log import NOT_USED
+    from jaxslam.logs.log_file import save_log
     from jaxslam.logs.readers import read
 
     if len(paths) < 2:
@@ -247,7 +248,7 @@ def check(log: LogName, /):
     Example: jaxslam check OUT.npz
     """
     from jaxslam.logs import diagnostics as examine
-    from jaxslam.logs.log import load_log
+    from jaxslam.logs.log_file import load_log
 
     findings = examine.check(load_log(log))
     for severity, text in findings:
@@ -314,7 +315,7 @@ def planar(
 
     Example: jaxslam simulate planar OUT.npz --world room --seed 1
     """
-    from jaxslam.logs.log import save_log
+    from jaxslam.logs.log_file import save_log
     from jaxslam.simulation import planar as worlds
 
     check_new(out, overwrite)

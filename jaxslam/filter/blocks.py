@@ -1,12 +1,25 @@
 """A block's share of some slots of the map, read and put back."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
-from jaxslam.filter.xla import rounds
+from jaxslam.filter import (
+    appearance,
+    association,
+    candidate_slots,
+    landmark_updates,
+    lazy_resampling,
+    new_landmarks,
+    proposal,
+)
+from jaxslam.filter.block_update import Observed, move_block, update_block
+from jaxslam.filter.xla import corner, listed, once, pinned, rounds
+from jaxslam.models import geometry, motion, sensors
 
 
-def renamed(measurements, slots, total):
+def local_identities(measurements, slots, total):
     """The measurements with the places of their slots among `slots` [S] as identities; S: none."""
     size, given = len(slots), measurements.identity
     local = jnp.full(total, size, jnp.int32)
@@ -16,7 +29,7 @@ def renamed(measurements, slots, total):
     return measurements._replace(identity=identity)
 
 
-def taken(world, slots, rows, start, width):
+def gather_block(world, slots, rows, start, width):
     """Of `slots` [S] the `rows` listed (indices, and how many), of `width` particles from `start`
     on; the others are empty. None: all slots."""
     if rows is None:
@@ -42,14 +55,7 @@ def taken(world, slots, rows, start, width):
     return rounds(count, one, empty)
 
 
-def corner(leaf, slot, start, *before):
-    """Where a slot's row begins, at places `before` (0: all); indices of one type, also in double
-    precision."""
-    before = before or (0,) * (leaf.ndim - 2)
-    return tuple(jnp.asarray(i, jnp.int32) for i in (*before, slot, start))
-
-
-def put(world, part, slots, rows, start):
+def scatter_block(world, part, slots, rows, start):
     """The map with what `taken` took replaced."""
     if rows is None:
         return jax.tree.map(
@@ -69,3 +75,185 @@ def put(world, part, slots, rows, start):
         return jax.tree.map(put, leaves, part)
 
     return rounds(count, one, world)
+
+
+SWEEP = 16  # steps
+SMALLEST = (
+    candidate_slots.FEW
+)  # slots of which a block takes copies; four times as many, and so on, or all
+
+
+def observe(state, chance, odometry, measurements, params, config, frozen=False):
+    """`Observed` of the N particles of a `filter.State` from before the motion.
+
+    `frozen`: for derivatives by `params` poses are what was drawn, whatever drew them, and the
+    density's derivative is that of the measurements alone (see `likelihood`).
+    """
+    hold = jax.lax.stop_gradient if frozen else lambda value: value
+    pose, n = state.pose, state.pose.shape[1]
+    measurements = sensors.rescaled(measurements, params)
+    params = params._replace(sigma_bearing=geometry.norm(params.sigma_bearing, params.caution))
+    if config.sensor == "bearing" and config.association == "maximum_likelihood":
+        params = sensors.at_most_one_new(params)
+    if not config.clutter:
+        params = params._replace(outlier=jnp.zeros(()))
+    # Outside the loop: XLA would work out cosine and sine again for every landmark.
+    sure = state.step >= 0
+    chance = chance._replace(normals=once(sure, lambda: chance.normals))
+    u = jnp.zeros_like(pose) if config.proposal == "informed" else chance.normals
+    # Pinned: worked out again where it is used, it would be rounded otherwise.
+    predicted = once(sure, lambda: motion.sample(pose, odometry, params, u))
+    predicted = pinned(hold(jnp.stack(predicted)))
+    sensor_pose = once(sure, lambda: sensors.pose_of(tuple(predicted), params))
+    sensor_pose = pinned(jnp.stack(sensor_pose))
+    alike = None if state.looks is None else appearance.gain(state.looks, measurements)
+    rows = _concerned(state, predicted, sensor_pose, odometry, measurements, alike, params, config)
+    rows &= measurements.active
+    world, past, rows = _caught_up(state, rows, config)
+    free = jnp.nonzero(~state.bounds.used, size=config.measurements, fill_value=config.landmarks)[0]
+    particles = pose, predicted, sensor_pose, chance.normals, chance.picks
+    frame = odometry, measurements, alike, params, free, state.step
+    match = jnp.full((config.measurements, n), association.PADDING, jnp.int32)
+    zero = jnp.zeros(n, pose.dtype)
+    counts = jnp.zeros((2, n), jnp.int32)
+    seen = Observed(predicted, world, zero, match, match, zero, counts, chance.normals)
+    seen = seen, jax.lax.stop_gradient(candidate_slots.nowhere(config, pose.dtype))
+    for size, chosen in _sizes(config, rows.sum()):
+        seen = _blocks(seen, particles, rows, frame, config, hold, size, chosen)
+    seen, found = seen
+    found = candidate_slots.joined(found, config)
+    if past is not None:  # what was free has nothing to catch up with
+        past = past._replace(
+            chain=jnp.where(found.used & ~state.bounds.used, lazy_resampling.CURRENT, past.chain)
+        )
+    looked = state.looks
+    if looked is not None:
+        looked = appearance.without(looked, found.used & ~state.bounds.used)
+    touched = rows | found.used
+    if landmark_updates.by_name(config):  # no bounds are asked for
+        bounds = candidate_slots.unlimited(state.bounds, found.used | (rows & state.bounds.used))
+    else:
+        bounds = jax.tree.map(lambda new, old: jnp.where(touched, new, old), found, state.bounds)
+    return seen._replace(bounds=bounds, ancestry=past, looks=looked, free=free)
+
+
+def _concerned(state, predicted, sensor_pose, odometry, measurements, alike, params, config):
+    """Slots [M] to look at."""
+    extra = 0.0
+    if config.proposal == "informed":
+        axes = proposal.axes(state.pose, predicted, sensor_pose, odometry, params)
+        extra = jnp.max(sum(x * x + y * y for x, y, _ in axes))
+    given = state.bounds, sensor_pose, measurements, alike, params, extra
+    return candidate_slots.concerned(config, *jax.lax.stop_gradient(given))
+
+
+def _caught_up(state, rows, config):
+    """The map with these slots [M] where their particles are, and its ancestry.
+
+    Particles that used a slot out of sight may have no descendants left: when slots run short, now
+    and then all are looked at.
+    """
+    looked = rows
+    if config.association != "known":
+        short = (~state.bounds.used).sum() < config.measurements
+        looked = rows | (state.bounds.used & short & (state.step % SWEEP == 0))
+    world, past = state.landmarks, state.ancestry
+    if past is not None:
+        world, past = lazy_resampling.update(
+            world, past, looked | lazy_resampling.last_of(past), config
+        )
+    return world, past, looked
+
+
+def _sizes(config, count):
+    """Numbers of slots that a block may look at, and which to go with: the smallest that `count`
+    fits in."""
+    total, size, sizes = config.landmarks, SMALLEST, []
+    if landmark_updates.by_name(config):
+        yield config.measurements, True
+        return
+    while size < total:
+        sizes.append(size)
+        size *= 4
+    least = -1
+    for size in (*sizes, total):
+        yield size, (least < count) & (count <= size)
+        least = size
+
+
+def _widths(n, most):
+    """(start, width, number) of blocks that make up n particles, alike but for one particle.
+
+    A narrow rest would be compiled to other arithmetic, and be rounded otherwise.
+    """
+    blocks = -(-n // most)
+    width, more = divmod(n, blocks)
+    yield 0, width, blocks - more
+    if more:
+        yield n - more * (width + 1), width + 1, more
+
+
+def _blocks(whole, particles, rows, frame, config, hold, size, chosen):
+    """`Observed` of all particles, each with `size` of the slots, if that is `chosen`."""
+    total = len(rows)
+    odometry, measurements, alike, params, free, number = frame
+    named = measurements
+    slots = jnp.arange(total, dtype=jnp.int32)
+    own, taken = None, None if size == total else (slots[:size], rows.sum())
+    put = taken
+    if landmark_updates.by_name(config):
+        own = landmark_updates.rows_of(measurements, total)
+        slots, taken, put = own.slot, listed(own.there), listed(own.there & (own.earlier == 0))
+    elif size < total:
+        slots = jnp.nonzero(rows, size=size, fill_value=total)[0].astype(jnp.int32)
+        measurements = local_identities(measurements, slots, total)
+        if alike is not None:
+            alike = jnp.pad(alike, ((0, 0), (0, 1)))[:, slots]
+
+    def block(i, carry, first, width):
+        carry, bounds = carry
+        start = first + i * width
+        mine = jax.tree.map(
+            lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, width, -1), particles
+        )
+        before = gather_block(carry.landmarks, slots, taken, start, width)
+        # Inside a branch the slices are arrays of their own. Fused into the arithmetic, in-place
+        # reading and writing of the large arrays stops its vectorisation: ten times slower.
+        done = jax.lax.cond(
+            measurements.active,
+            lambda *mine: update_block(
+                *mine, own, odometry, measurements, alike, params, config, hold
+            ),
+            lambda *mine: move_block(*mine, odometry, params, config, hold),
+            mine,
+            before,
+        )
+        if size < total and own is None:
+            at = slots[jnp.clip(done.match, 0, size - 1)]
+            done = done._replace(match=jnp.where(done.match >= 0, at, done.match))
+        rest = jax.tree.map(
+            lambda leaf, new: jax.lax.dynamic_update_slice_in_dim(leaf, new, start, -1),
+            carry._replace(landmarks=None),
+            done._replace(landmarks=None),
+        )
+        fixed = dict(anchor=None, birth=None)  # what a look leaves as it is
+        world = scatter_block(
+            carry.landmarks._replace(**fixed), done.landmarks._replace(**fixed), slots, put, start,
+        )._replace(anchor=carry.landmarks.anchor, birth=carry.landmarks.birth)  # fmt: skip
+        at = tuple(sensors.pose_of(tuple(done.pose), params))
+        if own is None:
+            bounds = candidate_slots.widened(bounds, jax.lax.stop_gradient(done.landmarks), slots)
+        world, born, lost = new_landmarks.create(
+            config, world, start, at, done.match, free, named, params, number
+        )
+        counts = jax.lax.dynamic_update_slice_in_dim(rest.counts, lost[None], start, -1)
+        return rest._replace(landmarks=world, counts=counts), candidate_slots.unlimited(
+            bounds, born
+        )
+
+    for first, width, blocks in _widths(particles[0].shape[1], config.block):
+        # A number that XLA does not know: it would open up a loop of one round, and fuse and round
+        # otherwise than in a loop of many.
+        count = pinned(jnp.where(chosen, blocks, 0))
+        whole = rounds(count, partial(block, first=first, width=width), whole)
+    return whole

@@ -9,8 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.filter import sharding
-from jaxslam.filter.blocks import corner
-from jaxslam.filter.xla import pinned
+from jaxslam.filter.xla import corner, pinned
 
 SHARE = 8  # of a device's particles one in so many belongs to a border
 

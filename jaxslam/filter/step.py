@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxslam.filter import (
     appearance,
-    block_update,
+    blocks,
     candidate_slots,
     landmarks,
     lazy_resampling,
@@ -202,7 +202,7 @@ def _info_specs():
 
 def advance(chance, state, odometry, measurements, params, config):
     """`step` with its random numbers given: `chance` is that of `draws`."""
-    seen = block_update.observe(state, chance, odometry, measurements, params, config)
+    seen = blocks.observe(state, chance, odometry, measurements, params, config)
     return conclude(chance, state, seen, measurements, config)
 
 

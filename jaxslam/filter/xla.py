@@ -68,3 +68,10 @@ def once(sure, work):
         )
 
     return jax.lax.cond(sure, work, never)
+
+
+def corner(leaf, slot, start, *before):
+    """Where a slot's row begins, at places `before` (0: all); indices of one type, also in double
+    precision."""
+    before = before or (0,) * (leaf.ndim - 2)
+    return tuple(jnp.asarray(i, jnp.int32) for i in (*before, slot, start))

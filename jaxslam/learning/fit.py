@@ -11,12 +11,8 @@ filtered with fresh seeds, say when to stop: the likelihood of what was learnt f
 after theirs began to fall.
 """
 
-import hashlib
-import json
 import time
-import zipfile
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -25,9 +21,9 @@ import numpy as np
 import optax
 
 from jaxslam.config import Params
-from jaxslam.files import replacing
 from jaxslam.filter import sharding
 from jaxslam.learning import likelihood
+from jaxslam.learning.checkpoint import fingerprint_of, load_state, save_state
 from jaxslam.learning.transforms import SCALE, from_free, plain, put, taken, to_free
 from jaxslam.parameter_file import validate
 
@@ -181,13 +177,13 @@ def fit(
     judged = stacked(held_out, config, params) if held_out else None
     taught = _Teacher(told, data, judged)
     state = taught.start()
-    print_of = _fingerprint(told, (data, judged))
+    fingerprint = fingerprint_of(told, (data, judged))
     if resume:
-        state = _load(checkpoint, print_of, state)
+        state = load_state(checkpoint, fingerprint, state)
     while state.step < steps and not state.stopped:
         state, record = taught.advance(state)
         if checkpoint is not None and (state.step % every == 0 or state.step == steps):
-            _save(checkpoint, print_of, state)
+            save_state(checkpoint, fingerprint, state)
         if progress:
             progress(state.step, steps, record)
     free, stopped = taught.estimate(state)
@@ -332,43 +328,3 @@ class _Teacher:
         best = int(values.argmax())
         good = values >= values[best] - 2 * np.hypot(errors, errors[best])
         return free[np.flatnonzero(good)[-1]], state.stopped or "all steps done"
-
-
-def _fingerprint(told, data):
-    """What a checkpoint belongs to."""
-    digest = hashlib.sha256(repr(told).encode())
-    for leaf in jax.tree.leaves(data):
-        digest.update(np.ascontiguousarray(leaf).tobytes())
-    return digest.hexdigest()
-
-
-def _save(path, print_of, state):
-    """Write the state, all or nothing."""
-    leaves = jax.tree.leaves(state.optimiser)
-    told = {"rows": state.rows, "judgements": state.judgements, "stopped": state.stopped}
-    text = json.dumps(told, default=lambda array: array.tolist())
-    arrays = {f"optimiser{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
-    with replacing(Path(path)) as file:
-        np.savez(file, fingerprint=print_of, step=state.step, free=state.free, told=text, **arrays)
-
-
-def _load(path, print_of, state):
-    """The state of a checkpoint. Raises `ValueError` if it is none, or of another fit."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            found = dict(file)
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no checkpoint to resume from") from None
-    except (OSError, ValueError, zipfile.BadZipFile) as err:
-        raise ValueError(f"{path}: not a checkpoint, or damaged: {err}") from err
-    if "fingerprint" not in found or str(found["fingerprint"]) != print_of:
-        raise ValueError(f"{path}: belongs to a fit of other logs or settings; start without it")
-    shape = jax.tree.structure(state.optimiser)
-    leaves = [jnp.asarray(found[f"optimiser{i}"]) for i in range(shape.num_leaves)]
-    told = json.loads(str(found["told"]))
-    rows, judgements = (
-        tuple(tuple(np.array(v) if isinstance(v, list) else v for v in row) for row in told[name])
-        for name in ("rows", "judgements")
-    )
-    return _State(int(found["step"]), found["free"], jax.tree.unflatten(shape, leaves), rows,
-                  judgements, told["stopped"])  # fmt: skip

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.config import Params
-from jaxslam.filter import block_update, resampling
+from jaxslam.filter import blocks, resampling
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.association import CLUTTER, NEW
 from jaxslam.filter.frames import frames
@@ -320,7 +320,7 @@ def _look(carry, chance, frame, params, config, through, frozen):
         world = state.landmarks._replace(**arrays)
         given = params._replace(**dict(zip(through, values, strict=True)))
         moved = state._replace(pose=pose, landmarks=world)
-        seen = block_update.observe(moved, chance, *frame, given, config, frozen=frozen)
+        seen = blocks.observe(moved, chance, *frame, given, config, frozen=frozen)
         moved = None if frozen else seen.pose
         return (moved, {name: getattr(seen.landmarks, name) for name in parts}, seen.density), seen
 

@@ -7,26 +7,16 @@ the plan under `truth/` and `plan/`, and numbers under `noise/` and `skipped/`. 
 """
 
 import math
-import zipfile
-from dataclasses import dataclass, field, fields
-from importlib import resources
-from pathlib import Path
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from jaxslam.config import Params
-from jaxslam.files import replacing
 from jaxslam.logs.validation import assign, check_rows, check_stamps, checked, checked_number
 
-SCHEMA = 1
-BUNDLED = ("lost-in-the-woods",)
 # Rows by design not for the filter (another robot seen) are counted under reasons that start so.
 NOT_USED = "not used: "
 KINDS = ("velocity", "command")
-MAX_BYTES = 1 << 30  # all entries together, unpacked
-MAX_ENTRIES = 1000
-MAX_DIMENSIONS = 4
-MAX_TEXT_BYTES = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,114 +256,3 @@ def _check_start(log):
     if np.abs(cov - cov.T).max() > 1e-9 * size or np.linalg.eigvalsh(cov)[0] < -1e-9 * size:
         raise ValueError("start_cov: is not a covariance (symmetric, no negative variance)")
     assign(log, "start_cov", cov)
-
-
-def save_log(path, log):
-    """Write a log to `path` (.npz), all or nothing: an interrupted write leaves the old file.
-
-    Raises `ValueError` when the place can't be written.
-    """
-    path = Path(path)
-    if path.suffix != ".npz":
-        raise ValueError(f"{path}: a log is a .npz file; name it {path.name}.npz")
-    with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
-        for name, array in entries(log).items():
-            # A fixed date: the same log makes the same bytes.
-            entry = zipfile.ZipInfo(name + ".npy", (1980, 1, 1, 0, 0, 0))
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            with archive.open(entry, "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, array, allow_pickle=False)
-
-
-def entries(log):
-    """The file's entries, by name."""
-    entries = {"schema": np.int64(SCHEMA)}
-    for part, prefix in ((log, ""), (log.truth, "truth/"), (log.plan, "plan/")):
-        for item in fields(part) if part is not None else ():
-            value = getattr(part, item.name)
-            if isinstance(value, dict):
-                entries |= {f"{item.name}/{key}": np.asarray(v) for key, v in value.items()}
-            elif value is not None and item.name not in ("truth", "plan"):
-                entries[prefix + item.name] = np.asarray(value)
-    return entries
-
-
-def load_log(path):
-    """The log in a `.npz` file, or the bundled one of that name (`lost-in-the-woods`).
-
-    Raises `ValueError` naming the file and what is wrong with it.
-    """
-    if str(path) in BUNDLED and not Path(path).exists():
-        source = resources.files("jaxslam") / "data" / f"{path}.npz"
-        with resources.as_file(source) as file:
-            return load_log(file)
-    path = Path(path)
-    if path.is_dir() or path.suffix.lower() in (".mat", ".csv", ".dat"):
-        raise ValueError(f"{path}: is no log; make one of it with: jaxslam convert {path} OUT.npz")
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file (bundled logs: {', '.join(BUNDLED)})")
-    try:
-        return _build(_read_entries(path))
-    except Exception as err:  # foreign bytes: zipfile, zlib and NumPy raise whatever they like
-        reason = (str(err).splitlines() or [type(err).__name__])[0]
-        raise ValueError(f"{path}: not a log, or damaged: {reason}") from err
-
-
-def _read_entries(path):
-    """The file's arrays by name, each checked against the caps before a byte of it is unpacked."""
-    with zipfile.ZipFile(path) as archive:
-        members = archive.infolist()
-        size = sum(member.file_size for member in members)
-        if len(members) > MAX_ENTRIES or size > MAX_BYTES:
-            found = f"{len(members)} entries of {size} bytes"
-            raise ValueError(f"{found}; allowed are {MAX_ENTRIES} of {MAX_BYTES}")
-        entries = {}
-        for member in members:
-            name = member.filename.removesuffix(".npy")
-            if name == member.filename or name in entries:
-                raise ValueError(f"entry {member.filename!r} is no array, or there twice")
-            with archive.open(member) as file:
-                _check_header(name, file, member.file_size)
-            with archive.open(member) as file:
-                entries[name] = np.lib.format.read_array(file, allow_pickle=False)
-                if file.read(1):  # also reaches the end, where the checksum is compared
-                    raise ValueError(f"entry {name!r} is longer than its array")
-    return entries
-
-
-def _check_header(name, file, size):
-    """Refuse objects and shapes that do not fit the entry's size."""
-    old = np.lib.format.read_magic(file) == (1, 0)
-    read = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(file)
-    if dtype.kind not in "iufU":
-        raise ValueError(f"entry {name!r} holds {dtype}; only numbers and text are allowed")
-    if len(shape) > MAX_DIMENSIONS or min(shape, default=0) < 0:
-        raise ValueError(f"entry {name!r} has shape {shape}; at most {MAX_DIMENSIONS} dimensions")
-    data = math.prod(shape) * dtype.itemsize
-    if data != size - file.tell() or (dtype.kind == "U" and data > MAX_TEXT_BYTES):
-        raise ValueError(f"entry {name!r} of shape {shape} can't be {size} bytes long")
-
-
-def _build(entries):
-    """A `Log` of the file's entries."""
-    schema = entries.pop("schema", None)
-    if schema is None or schema.tolist() != SCHEMA:
-        raise ValueError(f"it has schema {schema}; this version reads {SCHEMA}")
-    parts = {"": {}, "truth": {}, "plan": {}, "noise": {}, "skipped": {}}
-    allowed = {"": Log, "truth": Truth, "plan": FloorPlan}
-    for name, array in entries.items():
-        head, slash, tail = name.partition("/")
-        part, key = (head, tail) if slash else ("", name)
-        owner = allowed.get(part)
-        known = part in parts and (owner is None or key in [f.name for f in fields(owner)])
-        if not known or name in parts:
-            raise ValueError(f"unknown entry {name!r}")
-        parts[part][key] = array.item() if array.ndim == 0 else array
-    values = parts[""]
-    for name in ("name", "odometry_time", "odometry", "frame_time", "frame", "view"):
-        if name not in values:
-            raise ValueError(f"it has no entry {name!r}")
-    truth = Truth(**parts["truth"]) if parts["truth"] else None
-    plan = FloorPlan(**parts["plan"]) if parts["plan"] else None
-    return Log(**values, noise=parts["noise"], skipped=parts["skipped"], truth=truth, plan=plan)

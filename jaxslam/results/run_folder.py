@@ -24,7 +24,7 @@ import numpy as np
 
 from jaxslam.config import Config, Params
 from jaxslam.files import NO_SPACE, beside, move_folder, sync
-from jaxslam.logs.log import BUNDLED, load_log, save_log
+from jaxslam.logs.log_file import BUNDLED, load_log, save_log
 from jaxslam.results import figures as plot
 from jaxslam.results import run_lock
 from jaxslam.results.events import ambiguous, events

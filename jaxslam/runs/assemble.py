@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.filter import landmarks as maps
-from jaxslam.filter import sharding
+from jaxslam.filter import map_estimate, sharding
 from jaxslam.filter import step as fastslam
 from jaxslam.logs.odometry import dead_reckoning
 from jaxslam.results.result import MapEstimate, Result
@@ -130,7 +129,7 @@ def identity_of(dense, identities):
 
 def _map(state, best, params, config, identities, origin):
     """`MapEstimate`: the best particle's confirmed landmarks, averaged over all particles."""
-    table = maps.summarise(state.landmarks, jnp.exp(state.log_weight), best, params, config)
+    table = map_estimate.summarise(state.landmarks, jnp.exp(state.log_weight), best, params, config)
     table = jax.tree.map(np.asarray, table)
     kept = np.flatnonzero(table.kept)
     # Known identities are slots; without them no slot has one.

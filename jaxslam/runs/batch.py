@@ -23,8 +23,8 @@ from jaxslam.files import beside, move_folder, sync
 from jaxslam.filter.sharding import spread
 from jaxslam.parameter_file import validate
 from jaxslam.results import run_folder
-from jaxslam.results.ambiguity import entropy
-from jaxslam.runs import memory
+from jaxslam.results.events import entropy
+from jaxslam.runs import compiled, memory
 from jaxslam.runs import run as runner
 from jaxslam.runs.assemble import Filtered, result_of
 from jaxslam.smoother.genealogy import Tree
@@ -111,9 +111,9 @@ def run(log, config, todo, progress=None, refine=True, devices=1):
         raise ValueError("Config.devices: several runs are shared, not their particles; must be 1")
     if config.rejuvenate:
         return _in_turn(log, config, todo, progress, refine)
-    size = memory.of_arrays(runner.shapes(config))
+    size = memory.of_arrays(compiled.shapes(config))
     most = min(len(todo), max(devices, BYTES // size))
-    memory.check(runner.needed(config, len(log.frame_time)), config)
+    memory.check(compiled.needed(config, len(log.frame_time)), config)
     results, steps, total = [], None, len(todo) * len(log.frame_time)
     for first in range(0, len(todo), most):
         group = todo[first : first + most]
@@ -149,7 +149,7 @@ def _together(log, config, group, count, shared_by, steps, refine):
     wide = dataclasses.replace(config, particles=config.particles * len(group))
     kept = [Filtered(None, [], Tree(), 0, 0.0, None, []) for _ in range(count)]
     begin, compile_seconds = time.perf_counter(), 0.0
-    for chunks in zip(*(runner.chunks(part, wide) for part in data), strict=True):
+    for chunks in zip(*(compiled.chunks(part, wide) for part in data), strict=True):
         length, (odometry, _) = chunks[0]
         measurements = _stacked([chunk[1] for _, chunk in chunks])
         given = keys, states, jnp.int32(length), odometry, measurements, params
@@ -185,7 +185,7 @@ def _scan(keys, states, count, odometry, measurements, params, config, shared_by
 
     def one(run):
         key, state, measurements, params = run
-        return runner.filter_frames(key, state, count, odometry, measurements, params, config)
+        return compiled.filter_frames(key, state, count, odometry, measurements, params, config)
 
     return spread(one, (keys, states, measurements, params), shared_by)
 

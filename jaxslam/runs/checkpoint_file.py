@@ -13,7 +13,7 @@ from hashlib import sha256
 import numpy as np
 
 from jaxslam.files import replacing, sync
-from jaxslam.logs.log import entries
+from jaxslam.logs.log_file import entries
 
 FORMAT = 1
 MANIFEST = "manifest"

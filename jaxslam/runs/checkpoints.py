@@ -27,7 +27,7 @@ from jaxslam.filter import sharding
 from jaxslam.logs.odometry import Odometry
 from jaxslam.models.sensors import Measurements
 from jaxslam.results import run_folder, run_lock
-from jaxslam.runs import checkpoint_file, run
+from jaxslam.runs import checkpoint_file, compiled
 from jaxslam.runs import memory as capacity
 from jaxslam.runs.assemble import Filtered, Summary
 from jaxslam.runs.cluster import differences, end_now
@@ -51,7 +51,7 @@ def seconds(text):
 
 def memory(config, steps=1000):
     """`capacity.Memory` that a run of so many steps needs: compiled for it, nothing large made."""
-    size, k, looks = run.chunk_size(config), config.measurements, {}
+    size, k, looks = compiled.chunk_size(config), config.measurements, {}
     if config.descriptors:
         looks["descriptor"] = jnp.zeros((size, k, config.descriptors))
         looks["within"] = jnp.zeros((size, config.descriptors))
@@ -68,8 +68,8 @@ def memory(config, steps=1000):
         ),
     )
     params = jax.tree.map(jnp.asarray, default_params(config.sensor))
-    steps_compiled = run.compiled(config, chunk, params)
-    return capacity.of_compiled(steps_compiled, run.needed(config, steps), config)
+    steps_compiled = compiled.compiled(config, chunk, params)
+    return capacity.of_compiled(steps_compiled, compiled.needed(config, steps), config)
 
 
 class Checkpoints:

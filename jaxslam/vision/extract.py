@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxslam.logs.log import NOT_USED, FloorPlan, Log, save_log
+from jaxslam.logs.log import NOT_USED, FloorPlan, Log
+from jaxslam.logs.log_file import save_log
 from jaxslam.logs.odometry import increments
 from jaxslam.logs.readers.csv_files import read_odometry, read_truth
 from jaxslam.logs.readers.text_table import parse, pose_at, read_lines, settle

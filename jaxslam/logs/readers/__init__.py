@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from jaxslam.logs.log import BUNDLED, load_log
+from jaxslam.logs.log_file import BUNDLED, load_log
 from jaxslam.logs.readers.aer1513 import read_mat
 from jaxslam.logs.readers.csv_files import read_csv
 from jaxslam.logs.readers.mrclam import read_mrclam

@@ -1,0 +1,90 @@
+"""The map as users read it: landmarks of all particles as Cartesian means and covariances."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.filter import sharding
+from jaxslam.filter.xla import pinned
+from jaxslam.models import geometry
+
+
+class Table(NamedTuple):
+    """One map for all particles, M slots: world `mean` [2, M], `cov` [3, M], `count`, `birth`, and
+    whether the slot is `kept`: occupied, confirmed, and of known depth."""
+
+    mean: jax.Array
+    cov: jax.Array
+    count: jax.Array
+    birth: jax.Array
+    kept: jax.Array
+
+
+@partial(jax.jit, static_argnames="config")
+def summarise(world, weight, best, params, config):
+    """The map of particle `best`, each landmark averaged over the particles that share its birth.
+
+    The covariance is the mixture's: the mean of the particles' own, and the spread of their means.
+    """
+    shared = sharding.same((best, params))
+    specs = sharding.lanes(world), sharding.lanes(weight), *shared
+    summary = sharding.divided(partial(_summarise, config=config), specs, sharding.ALL, config)
+    return summary(world, weight, best, params)
+
+
+def _summarise(world, weight, best, params, config):
+    mine = sharding.one(world, best, config)
+    centre, _, depth_known = to_world(config.sensor, mine)
+    confirmed = True if mine.log_odds is None else mine.log_odds >= params.existence_confirm
+
+    slots, lane = jnp.arange(len(mine.birth)), jnp.arange(len(weight))
+
+    def one(birth, centre):
+        # Births of one frame may be in other slots where a particle had more of them.
+        same = (world.birth == birth) & (world.count > 0)
+        at = jnp.where(same, slots[:, None], -1).max(0)
+        row = jax.tree.map(lambda leaf: leaf[..., jnp.maximum(at, 0), lane], world)
+        row, share = sharding.whole((row, weight * (at >= 0)), config)
+        point, cov, known = to_world(config.sensor, row)
+        share = jnp.where(known, share, 0)
+        # Pinned: joined with what comes before, sums would be rounded by the number of devices.
+        share = pinned(share / pinned(share).sum())
+        dx, dy = (jnp.where(known, p - c, 0) for p, c in zip(point, centre, strict=True))
+        mx, my = pinned(jnp.stack([share * dx, share * dy])).sum(1)
+        spread = ((dx - mx) ** 2, (dx - mx) * (dy - my), (dy - my) ** 2)
+        parts = [
+            jnp.where(share > 0, share * (own + between), 0)
+            for own, between in zip(cov, spread, strict=True)
+        ]
+        return jnp.stack([centre[0] + mx, centre[1] + my]), pinned(jnp.stack(parts)).sum(1)
+
+    mean, cov = jax.lax.map(lambda args: one(*args), (mine.birth, jnp.stack(centre, -1)))
+    kept = (mine.count > 0) & confirmed & depth_known
+    return Table(mean.T, cov.T, mine.count, mine.birth, kept)
+
+
+def to_world(sensor, world):
+    """World point (x, y), covariance (xx, xy, yy) and whether its depth is known, of every slot.
+
+    An inverse depth counts as known when it is three standard deviations from zero.
+    """
+    if sensor != "bearing":
+        return (
+            tuple(world.mean),
+            geometry.covariance(world.factor),
+            jnp.full(world.count.shape, True),
+        )
+    (angle, depth), (pp, pd, dd) = world.mean, geometry.covariance(world.factor)
+    known = depth > 3 * jnp.sqrt(dd)
+    depth = jnp.where(known, depth, 1.0)
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    # Columns of the Jacobian: by direction, by inverse depth.
+    ax, ay, bx, by = -s / depth, c / depth, -c / depth**2, -s / depth**2
+    cov = (
+        ax * ax * pp + 2 * ax * bx * pd + bx * bx * dd,
+        ax * ay * pp + (ax * by + ay * bx) * pd + bx * by * dd,
+        ay * ay * pp + 2 * ay * by * pd + by * by * dd,
+    )
+    return (world.anchor[0] + c / depth, world.anchor[1] + s / depth), cov, known

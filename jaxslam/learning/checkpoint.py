@@ -1,0 +1,60 @@
+"""Checkpoints of a fit."""
+
+import hashlib
+import json
+import zipfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.files import replacing
+
+
+def fingerprint_of(settings, data):
+    """What a checkpoint belongs to."""
+    digest = hashlib.sha256(repr(settings).encode())
+    for leaf in jax.tree.leaves(data):
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()
+
+
+def save_state(path, fingerprint, state):
+    """Write the state, all or nothing."""
+    leaves = jax.tree.leaves(state.optimiser)
+    told = {"rows": state.rows, "judgements": state.judgements, "stopped": state.stopped}
+    text = json.dumps(told, default=lambda array: array.tolist())
+    arrays = {f"optimiser{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
+    with replacing(Path(path)) as file:
+        np.savez(
+            file, fingerprint=fingerprint, step=state.step, free=state.free, told=text, **arrays
+        )
+
+
+def load_state(path, fingerprint, state):
+    """The state of a checkpoint. Raises `ValueError` if it is none, or of another fit."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            found = dict(file)
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no checkpoint to resume from") from None
+    except (OSError, ValueError, zipfile.BadZipFile) as err:
+        raise ValueError(f"{path}: not a checkpoint, or damaged: {err}") from err
+    if "fingerprint" not in found or str(found["fingerprint"]) != fingerprint:
+        raise ValueError(f"{path}: belongs to a fit of other logs or settings; start without it")
+    shape = jax.tree.structure(state.optimiser)
+    leaves = [jnp.asarray(found[f"optimiser{i}"]) for i in range(shape.num_leaves)]
+    told = json.loads(str(found["told"]))
+    rows, judgements = (
+        tuple(tuple(np.array(v) if isinstance(v, list) else v for v in row) for row in told[name])
+        for name in ("rows", "judgements")
+    )
+    return type(state)(
+        step=int(found["step"]),
+        free=found["free"],
+        optimiser=jax.tree.unflatten(shape, leaves),
+        rows=rows,
+        judgements=judgements,
+        stopped=told["stopped"],
+    )
