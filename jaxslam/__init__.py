@@ -32,6 +32,7 @@ _WHERE = {
     "step": "filter.step",
     "State": "filter.step",
     "Info": "filter.step",
+    "load_result": "results.load",
     "errors": "results.metrics",
     "planar": "simulation.planar",
     "Camera": "vision.camera",

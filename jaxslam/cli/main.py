@@ -265,10 +265,10 @@ def evaluate(folder: Folder, /, *, json: option(bool, "as JSON") = False, log: M
     from json import dumps
 
     with bar("reading"):
-        from jaxslam.results import run_folder
+        from jaxslam.results import load
         from jaxslam.results.tables import error_table
 
-        errors = run_folder.evaluate_folder(folder, log)
+        errors = load.evaluate_folder(folder, log)
     print(dumps(errors, indent=2) if json else error_table(errors))
 
 
@@ -279,7 +279,7 @@ def plot(folder: Folder, /, *, log: MovedLog = None):
     Example: jaxslam plot runs/demo
     """
     with bar("drawing"):
-        from jaxslam.results.figures import plot_folder
+        from jaxslam.results.load import plot_folder
 
         paths = plot_folder(folder, log)
     for path in paths:

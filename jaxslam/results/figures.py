@@ -30,7 +30,7 @@ from jaxslam.results.metrics import ate, paths, with_truth
 FIGURES = ("map.png", "error.png", "particles.png")
 
 
-def plot(result, directory):
+def draw_figures(result, directory):
     """Write map.png, error.png and particles.png of a result into a folder; returns their paths.
 
     Raises `ValueError` if they can't be written.
@@ -42,13 +42,6 @@ def plot(result, directory):
             figure = draw(result)
             paths.append(write_figure(figure, directory / name))
     return paths
-
-
-def plot_folder(directory, log=None):
-    """Draw the figures of a saved run anew; `log`: where its log is, if it was moved."""
-    from jaxslam.results.run_folder import load  # here, since the report draws
-
-    return plot(load(directory, log), directory)
 
 
 def draw_map(result):

@@ -171,6 +171,6 @@ class Result:
 
     def save(self, directory, overwrite=False, log_source=None):
         """Write the run's folder (`report.save`); without a `log_source` the log is copied too."""
-        from jaxslam.results import run_folder
+        from jaxslam.results import run_folder  # here: it brings matplotlib
 
         run_folder.save(self, directory, overwrite=overwrite, log_source=log_source)

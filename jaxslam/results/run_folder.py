@@ -11,23 +11,19 @@ are the filter's, as it knew them at the time and at the end; `trajectory_refine
 import json
 import os
 import shutil
-import tomllib
-import zlib
 from importlib.metadata import PackageNotFoundError, version
 from math import cos, isfinite, sin
 from numbers import Integral
 from pathlib import Path
 from platform import python_version
-from zipfile import BadZipFile
 
 import numpy as np
 
-from jaxslam.config import Config, Params
 from jaxslam.files import NO_SPACE, beside, move_folder, sync
-from jaxslam.logs.log_file import BUNDLED, load_log, save_log
-from jaxslam.results import figures as plot
+from jaxslam.logs.log_file import BUNDLED, save_log
 from jaxslam.results import run_lock
 from jaxslam.results.events import ambiguous, events
+from jaxslam.results.figures import FIGURES, draw_figures
 from jaxslam.results.metrics import errors
 
 COLUMNS = (
@@ -41,7 +37,7 @@ WORKING = (run_lock.NAME, CHECKPOINTS, PARTIAL)  # what only an unfinished run's
 MAYBE = ("entropy", "events")  # columns that not every run has
 LOOKING_BACK = ("ancestral", "lineage", "refined")  # columns of what a run need not have
 FILES = (
-    *(*NEEDED, "trajectory.tum", "landmarks.csv", "events.jsonl", "log.npz", *plot.FIGURES),
+    *(*NEEDED, "trajectory.tum", "landmarks.csv", "events.jsonl", "log.npz", *FIGURES),
     *("trajectory_refined.tum", "landmarks_refined.csv"),
 )
 
@@ -139,74 +135,6 @@ def _check_existing(directory, overwrite, resume):
         raise ValueError(f"{directory}: is not a run's folder, so it is not overwritten")
     if strange := sorted(names - {*FILES, *WORKING}):
         raise ValueError(f"{directory}: holds {strange[0]}, not of a run, so it is not overwritten")
-
-
-def load(directory, log=None):
-    """The `Result` saved in a run's folder. `log`: where its log is now, if it was moved.
-
-    Raises `ValueError` if a file is missing or broken, or if the log isn't the run's.
-    """
-    from jaxslam.results.result import MapEstimate, Result  # here, since results save themselves
-
-    directory = Path(directory)
-    try:
-        told = tomllib.loads((directory / "run.toml").read_text(encoding="utf-8"))
-        config, params = Config(**told["config"]), Params(**told["params"])
-        summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
-        with (
-            open(directory / "steps.npz", "rb") as file,
-            np.load(file, allow_pickle=False) as steps,
-        ):
-            columns = {name: steps[name] for name in COLUMNS}
-            landmarks = MapEstimate(**_part("map", steps))
-            columns |= _looking_back(steps)
-            columns |= {name: steps[name] for name in MAYBE if name in steps.files}
-        seed, source = told["seed"], told["log"]
-        spent = {name: summary[name] for name in ("seconds", "compile_seconds", "dropped")}
-        spent["refine_seconds"] = summary.get("refine_seconds")
-    except FileNotFoundError as error:
-        raise ValueError(
-            f"{directory}: no {Path(error.filename).name}; not a run's folder"
-        ) from None
-    except (OSError, KeyError, TypeError, ValueError, EOFError, BadZipFile, zlib.error) as error:
-        raise ValueError(f"{directory}: a broken run's folder ({error}); run it again") from error
-    log = _find_log(directory, source) if log is None else load_log(log)
-    if not np.isin(columns["time"], log.frame_time).all():
-        raise ValueError(f"{directory}: {log.name} is not the log of this run (frame times differ)")
-    return Result(
-        log=log,
-        config=config,
-        params=params,
-        seed=seed,
-        landmarks=landmarks,
-        **columns,
-        **spent,
-    )
-
-
-def _part(name, steps):
-    """The columns of `steps.npz` whose names begin so, without that; numbers as numbers."""
-    begin = f"{name}_"
-    columns = {key[len(begin) :]: steps[key] for key in steps.files if key.startswith(begin)}
-    return {key: value if value.ndim else value.item() for key, value in columns.items()}
-
-
-def _looking_back(steps):
-    """What a run found out looking back, as far as it is there: older folders have none of it."""
-    from jaxslam.smoother.genealogy import Ancestral, Lineage
-
-    found = {name: _part(name, steps) for name in LOOKING_BACK}
-    kinds = {"ancestral": Ancestral, "lineage": Lineage}
-    if found["refined"]:
-        from jaxslam.smoother.refine import Refined  # brings JAX, which nothing else here needs
-
-        kinds["refined"] = Refined
-    return {name: kind(**found[name]) for name, kind in kinds.items() if found[name]}
-
-
-def evaluate_folder(directory, log=None):
-    """The errors of a saved run, computed anew from its columns and its log's truth."""
-    return errors(load(directory, log))
 
 
 def summarise(result):
@@ -326,7 +254,7 @@ def _write_files(result, folder, source, figures=True):
         with open(folder / name, "w", encoding="utf-8", newline="\n") as file:
             file.writelines(lines)
     if figures:
-        plot.plot(result, folder)
+        draw_figures(result, folder)
     sync(*folder.iterdir(), folder)
 
 
@@ -337,13 +265,6 @@ def _source(log_source, target):
     path = Path(log_source).resolve()
     # A log inside the folder that is being replaced would go with it.
     return None if path.is_relative_to(target) else str(path)
-
-
-def _find_log(directory, source):
-    try:
-        return load_log(source if source in BUNDLED else directory / source)
-    except ValueError as error:
-        raise ValueError(f"{error}; it is the log of {directory}: say --log PATH") from error
 
 
 def _unwritable(directory, error):

@@ -14,7 +14,7 @@ from small_run import make_refined
 from jaxslam.cli import main as cli
 from jaxslam.logs.log_file import load_log, save_log
 from jaxslam.reference import compare, variants
-from jaxslam.results import run_folder
+from jaxslam.results import load
 from jaxslam.runs import run as runner
 from jaxslam.simulation import planar as simulate
 
@@ -111,7 +111,7 @@ def test_informed_and_drawn(log, call):
     code, out, _ = call(*run, "--out", "result")
     assert code == 0
     assert "path, filter" in out
-    config = run_folder.load("result").config
+    config = load.load_result("result").config
     assert (config.association, config.proposal) == ("sampled", "informed")
 
 
@@ -131,7 +131,7 @@ def test_overwriting_keeps_the_old_folder_until_the_new_one_is_there(log, call):
     run = "run", log, *MANY, "--out", "result"
     assert call(*run)[0] == 0
     assert call(*run, "--overwrite", "--seed", "1")[0] == 0
-    assert run_folder.load("result").seed == 1
+    assert load.load_result("result").seed == 1
 
 
 def test_options_of_simulate_are_those_of_the_library(at, call, monkeypatch):
@@ -331,7 +331,7 @@ def test_parameters(log, at, call, refuse):
     assert "none.toml: no such file" in refuse("compare", log, "--params", "none.toml")
     (at / "p.toml").write_text("sigma_range = 0.25\n")
     assert call("run", log, *MANY, "--params", "p.toml", "--out", "result")[0] == 0
-    found = run_folder.load("result").params
+    found = load.load_result("result").params
     assert found.sigma_range == 0.25
     assert found.err_tran == load_log(log).noise["err_tran"]
 

@@ -9,13 +9,13 @@ from matplotlib.image import imread
 from small_run import make_log, make_refined, make_result
 
 from jaxslam.logs.log import FloorPlan
-from jaxslam.results import figures, run_folder
+from jaxslam.results import figures, load, run_folder
 from jaxslam.results.result import MapEstimate
 
 
 def pictures(result, folder):
     folder.mkdir(exist_ok=True)
-    return {path.name: imread(path) for path in figures.plot(result, folder)}
+    return {path.name: imread(path) for path in figures.draw_figures(result, folder)}
 
 
 def pixels(draw, result):
@@ -193,13 +193,13 @@ def test_saved_runs_are_drawn_anew(tmp_path):
     run_folder.save(make_result(), tmp_path / "run")
     before = imread(tmp_path / "run" / "map.png")
     (tmp_path / "run" / "map.png").unlink()
-    figures.plot_folder(tmp_path / "run")
+    load.plot_folder(tmp_path / "run")
     np.testing.assert_array_equal(imread(tmp_path / "run" / "map.png"), before)
 
 
 def test_an_unwritable_place_is_a_one_line_error(tmp_path):
     with pytest.raises(ValueError, match=r"map\.png: cannot write"):
-        figures.plot(make_result(), tmp_path / "missing")
+        figures.draw_figures(make_result(), tmp_path / "missing")
 
 
 def test_pyplot_is_never_touched():

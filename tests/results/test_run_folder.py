@@ -12,7 +12,7 @@ from small_run import LANDMARKS, START, make_log, make_refined, make_result
 from jaxslam.config import Config, Params
 from jaxslam.logs.log import Truth
 from jaxslam.logs.log_file import save_log
-from jaxslam.results import metrics, run_folder
+from jaxslam.results import load, metrics, run_folder
 from jaxslam.results.events import events as events_of
 from jaxslam.results.tables import error_table
 
@@ -35,12 +35,12 @@ def same(a, b):
 def test_what_is_saved_is_loaded_again(tmp_path, make):
     result = make()
     run_folder.save(result, tmp_path / "run", figures=False)
-    loaded = run_folder.load(tmp_path / "run")
+    loaded = load.load_result(tmp_path / "run")
     for item in dataclasses.fields(result):
         if item.name not in ("log", "params"):
             assert same(getattr(loaded, item.name), getattr(result, item.name)), item.name
     assert loaded.params == tuple(map(float, result.params))
-    assert run_folder.evaluate_folder(tmp_path / "run") == metrics.errors(result)
+    assert load.evaluate_folder(tmp_path / "run") == metrics.errors(result)
 
 
 def test_what_was_refined_has_files_of_its_own(tmp_path):
@@ -88,7 +88,7 @@ def test_run_toml_resolves_everything(tmp_path):
     assert Params(**told["params"]) == tuple(map(float, result.params))
     assert (told["seed"], told["log"], told["name"]) == (7, str(source), "circle")
     assert not (tmp_path / "run" / "log.npz").exists()
-    assert run_folder.load(tmp_path / "run").log.name == "circle"
+    assert load.load_result(tmp_path / "run").log.name == "circle"
 
 
 def test_a_bundled_log_is_told_by_name(tmp_path):
@@ -96,7 +96,7 @@ def test_a_bundled_log_is_told_by_name(tmp_path):
     told = tomllib.loads((tmp_path / "run" / "run.toml").read_text(encoding="utf-8"))
     assert told["log"] == NAME
     with pytest.raises(ValueError, match="not the log of this run"):
-        run_folder.load(tmp_path / "run")
+        load.load_result(tmp_path / "run")
 
 
 def test_trajectory_keeps_every_nanosecond_and_uses_plain_decimals():
@@ -173,7 +173,7 @@ def test_an_existing_folder_is_kept_without_overwrite(tmp_path):
         run_folder.save(make_result(shift=0.5), tmp_path / "run", figures=False)
     assert contents(tmp_path / "run") == before
     run_folder.save(make_result(shift=0.5), tmp_path / "run", overwrite=True, figures=False)
-    assert run_folder.evaluate_folder(tmp_path / "run")["ate_filtered_unaligned_rmse_m"] > 0.4
+    assert load.evaluate_folder(tmp_path / "run")["ate_filtered_unaligned_rmse_m"] > 0.4
     assert os.listdir(tmp_path) == ["run"]
 
 
@@ -249,12 +249,12 @@ def test_a_rerun_over_its_own_stored_log_keeps_the_log(tmp_path):
         make_result(), folder, overwrite=True, log_source=folder / "log.npz", figures=False
     )
     shutil.move(folder, tmp_path / "elsewhere")
-    assert run_folder.load(tmp_path / "elsewhere").log.name == "circle"
+    assert load.load_result(tmp_path / "elsewhere").log.name == "circle"
 
 
 def test_broken_folders_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"nowhere: no run\.toml"):
-        run_folder.load(tmp_path / "nowhere")
+        load.load_result(tmp_path / "nowhere")
     run_folder.save(make_result(), tmp_path / "run", figures=False)
     for name, text in (
         ("steps.npz", b"PK\x03\x04"),
@@ -265,16 +265,16 @@ def test_broken_folders_are_named(tmp_path):
         kept = (tmp_path / "run" / name).read_bytes()
         (tmp_path / "run" / name).write_bytes(text)
         with pytest.raises(ValueError, match="a broken run's folder"):
-            run_folder.load(tmp_path / "run")
+            load.load_result(tmp_path / "run")
         (tmp_path / "run" / name).write_bytes(kept)
     (tmp_path / "run" / "log.npz").unlink()
     with pytest.raises(ValueError, match="--log PATH"):
-        run_folder.load(tmp_path / "run")
+        load.load_result(tmp_path / "run")
     save_log(tmp_path / "moved.npz", make_log())
-    assert run_folder.load(tmp_path / "run", tmp_path / "moved.npz").seed == 7
+    assert load.load_result(tmp_path / "run", tmp_path / "moved.npz").seed == 7
     save_log(tmp_path / "other.npz", make_log(frames=20))
     with pytest.raises(ValueError, match="not the log of this run"):
-        run_folder.load(tmp_path / "run", tmp_path / "other.npz")
+        load.load_result(tmp_path / "run", tmp_path / "other.npz")
 
 
 def test_error_table_puts_dead_reckoning_beside_the_filter():

@@ -17,7 +17,7 @@ from test_appearance import coloured
 
 from jaxslam.config import default_params
 from jaxslam.logs.log_file import save_log
-from jaxslam.results import run_folder, run_lock
+from jaxslam.results import load, run_folder, run_lock
 from jaxslam.runs import checkpoint_file, compiled, run
 from jaxslam.runs import checkpoints as offline
 from jaxslam.runs.run import config_for
@@ -246,7 +246,7 @@ def test_at_most_two_are_kept_and_none_in_the_end(there, call, monkeypatch):
         in call(*LONG, "--resume", "--seed", 1)[2]
     )
     assert call(*LONG, "--overwrite", "--seed", 1)[0] == 0
-    assert run_folder.load("out").seed == 1
+    assert load.load_result("out").seed == 1
 
 
 def test_with_nothing_there_it_starts_from_the_beginning(there, call, refuse):

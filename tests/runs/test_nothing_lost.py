@@ -9,7 +9,7 @@ import pytest
 from jaxslam.config import default_params
 from jaxslam.logs.log_file import save_log
 from jaxslam.logs.slicing import cut
-from jaxslam.results import run_folder
+from jaxslam.results import load
 from jaxslam.runs import batch, checkpoints, run
 from jaxslam.simulation.planar import planar
 from jaxslam.smoother import reassociation, refine
@@ -34,7 +34,7 @@ def test_what_was_filtered_outlives_a_refinement_that_fails(log, call, monkeypat
     code, _, err = call(*RUN, "--out", "out")
     line = "path and map could not be refined, for want of memory or of a solution"
     assert (code, err.splitlines()[-1]) == (1, f"warning: {line}")
-    again = run_folder.load("out")
+    again = load.load_result("out")
     assert np.isfinite(again.pose).all() and again.refined is None
     assert again.flags == [line]
 

@@ -1,0 +1,93 @@
+"""Read a run's folder back, and draw or score it anew."""
+
+import json
+import tomllib
+import zlib
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from jaxslam.config import Config, Params
+from jaxslam.logs.log_file import BUNDLED, load_log
+from jaxslam.results.figures import draw_figures
+from jaxslam.results.metrics import errors
+from jaxslam.results.result import MapEstimate, Result
+from jaxslam.results.run_folder import COLUMNS, LOOKING_BACK, MAYBE
+from jaxslam.smoother.genealogy import Ancestral, Lineage
+
+
+def load_result(directory, log=None):
+    """The `Result` saved in a run's folder. `log`: where its log is now, if it was moved.
+
+    Raises `ValueError` if a file is missing or broken, or if the log isn't the run's.
+    """
+    directory = Path(directory)
+    try:
+        told = tomllib.loads((directory / "run.toml").read_text(encoding="utf-8"))
+        config, params = Config(**told["config"]), Params(**told["params"])
+        summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
+        with (
+            open(directory / "steps.npz", "rb") as file,
+            np.load(file, allow_pickle=False) as steps,
+        ):
+            columns = {name: steps[name] for name in COLUMNS}
+            landmarks = MapEstimate(**_part("map", steps))
+            columns |= _looking_back(steps)
+            columns |= {name: steps[name] for name in MAYBE if name in steps.files}
+        seed, source = told["seed"], told["log"]
+        spent = {name: summary[name] for name in ("seconds", "compile_seconds", "dropped")}
+        spent["refine_seconds"] = summary.get("refine_seconds")
+    except FileNotFoundError as error:
+        raise ValueError(
+            f"{directory}: no {Path(error.filename).name}; not a run's folder"
+        ) from None
+    except (OSError, KeyError, TypeError, ValueError, EOFError, BadZipFile, zlib.error) as error:
+        raise ValueError(f"{directory}: a broken run's folder ({error}); run it again") from error
+    log = _find_log(directory, source) if log is None else load_log(log)
+    if not np.isin(columns["time"], log.frame_time).all():
+        raise ValueError(f"{directory}: {log.name} is not the log of this run (frame times differ)")
+    return Result(
+        log=log,
+        config=config,
+        params=params,
+        seed=seed,
+        landmarks=landmarks,
+        **columns,
+        **spent,
+    )
+
+
+def _part(name, steps):
+    """The columns of `steps.npz` whose names begin so, without that; numbers as numbers."""
+    begin = f"{name}_"
+    columns = {key[len(begin) :]: steps[key] for key in steps.files if key.startswith(begin)}
+    return {key: value if value.ndim else value.item() for key, value in columns.items()}
+
+
+def _looking_back(steps):
+    """What a run found out looking back, as far as it is there: older folders have none of it."""
+    found = {name: _part(name, steps) for name in LOOKING_BACK}
+    kinds = {"ancestral": Ancestral, "lineage": Lineage}
+    if found["refined"]:
+        from jaxslam.smoother.refine import Refined  # brings JAX, which nothing else here needs
+
+        kinds["refined"] = Refined
+    return {name: kind(**found[name]) for name, kind in kinds.items() if found[name]}
+
+
+def evaluate_folder(directory, log=None):
+    """The errors of a saved run, computed anew from its columns and its log's truth."""
+    return errors(load_result(directory, log))
+
+
+def _find_log(directory, source):
+    try:
+        return load_log(source if source in BUNDLED else directory / source)
+    except ValueError as error:
+        raise ValueError(f"{error}; it is the log of {directory}: say --log PATH") from error
+
+
+def plot_folder(directory, log=None):
+    """Draw the figures of a saved run anew; `log`: where its log is, if it was moved."""
+    return draw_figures(load_result(directory, log), directory)
