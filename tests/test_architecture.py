@@ -34,4 +34,4 @@ def test_a_wrong_import_is_found(tmp_path):
     assert code == 1, out
     assert "imports point down BROKEN" in out
     assert "of jaxslam only cli imports calibration BROKEN" in out
-    assert "inside the filter KEPT" in out
+    assert "inside the results KEPT" in out
