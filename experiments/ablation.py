@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam import config_for, default_params, load_log, run
-from jaxslam.results.metrics import errors
+from jaxslam.results.metrics import compute_errors
 
 RESULTS = Path(__file__).parent / "results"
 # the motion and the bearing noise of the version before
@@ -47,7 +47,7 @@ def measure(log, settings, changes, particles, seeds):
     rows = []
     for seed in seeds:
         result = run(log, config, params, seed)
-        found = errors(result)
+        found = compute_errors(result)
         row = [found.get(key, np.nan) for key in COLUMNS]
         rows.append([*row, result.log_likelihood, result.resampled.mean()])
     return np.mean(rows, axis=0)

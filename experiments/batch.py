@@ -23,12 +23,12 @@ import numpy as np
 
 from calibration.odometry import fit_odometry
 from jaxslam import default_params, load_log, load_params
-from jaxslam.filter.frames import frames
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.readers import read_mrclam
 from jaxslam.logs.truth import truth_at, wrap
 from jaxslam.models import sensors
 from jaxslam.models.motion import model
-from jaxslam.results.metrics import align_se2, ate, between, map_error, with_truth
+from jaxslam.results.metrics import align_se2, ate, has_truth, map_error, relative_pose
 
 HERE = Path(__file__).parent
 NOISES = ("sigma_bearing", "growth", "err_tran", "err_rot", "err_drift", "floor_tran")
@@ -72,7 +72,7 @@ def solve(log, params, start=None, rounds=30):
     from the starting path meet.
     """
     begin = time.perf_counter()
-    data = frames(log, "bearing", None, params, True)
+    data = frames_from_log(log, "bearing", None, params, True)
     frame, slot = np.nonzero(data.measurements.valid)
     who, bearing = data.measurements.identity[frame, slot], data.measurements.value[frame, slot, 0]
     pose = true_start(log, data) if start is None else np.array(start, float)
@@ -189,7 +189,7 @@ def bearing_noise(odometry, params):
     """Variance far away and variance x range^2 of the frames' bearings [T], inflated, and both not
     inflated (the measurement is judged by its own noise)."""
     with jax.enable_x64(True):
-        inflated = sensors.correlated(params, odometry)
+        inflated = sensors.correlated_noise(params, odometry)
     ones = np.ones(len(odometry.dx))
     return (
         np.asarray(inflated.sigma_bearing, float) ** 2 * ones,
@@ -219,7 +219,7 @@ def inlier(residual, variance, noise, frame, params):
 
 def motion_cost(sensor, move, cov):
     """- log density of the path [1 + T, 3] under the intervals' motion, but for a constant."""
-    step = between(sensor[:-1], sensor[1:]) - move
+    step = relative_pose(sensor[:-1], sensor[1:]) - move
     c, s = np.cos(move[:, 2]), np.sin(move[:, 2])
     error = np.column_stack(
         [c * step[:, 0] + s * step[:, 1], c * step[:, 1] - s * step[:, 0], wrap(step[:, 2])]
@@ -260,7 +260,7 @@ def errors(batch, log):
     """Errors of a batch solution: `ate_m` aligned and not, and its landmarks, aligned as the path
     is (`landmark_m`) and not; `scale` of the map over the true one."""
     true = truth_at(log.truth, log.frame_time)
-    have = with_truth(true)
+    have = has_truth(true)
     found = {
         "ate_m": ate(batch.pose, true)[0],
         "ate_unaligned_m": ate(batch.pose, true, align=False)[0],

@@ -71,7 +71,7 @@ def of_jax(marks, config, params=PARAMS, donated=True):
     factor = np.array([[KNOWN_TO], [0], [KNOWN_TO]]) * np.ones(len(marks))
     init = partial(fastslam.init, config, landmarks_given=(marks.T, factor))
     shapes = jax.eval_shape(init, key)
-    size = memory.of_arrays(shapes)
+    size = memory.bytes_of(shapes)
     step = jax.jit(
         fastslam.step, static_argnames="config", donate_argnames="state" if donated else ()
     )
@@ -79,7 +79,7 @@ def of_jax(marks, config, params=PARAMS, donated=True):
     if config.devices == 1:  # before the state is there, as a run does: compiling takes memory, too
         given = key, shapes, odometry, frame(np.zeros((k, 2)), hidden), params
         step = step.func.lower(*given, config).compile()
-        memory.give_back()
+        memory.trim_heap()
     state = init(key)
 
     def advance(z, ids):
@@ -88,7 +88,7 @@ def of_jax(marks, config, params=PARAMS, donated=True):
         return info.estimate.mean
 
     def held():
-        return float((fastslam.settled(state, config).landmarks.count > 0).sum(0).mean())
+        return float((fastslam.settle(state, config).landmarks.count > 0).sum(0).mean())
 
     return advance, held, size
 

@@ -155,7 +155,7 @@ def seeds(data, discount, keys, config, estimator):
     params = jax.tree.map(jnp.asarray, PARAMS)
 
     def one(key):
-        found = likelihood.scored(params, data, key, config, NAMES, estimator, discount)
+        found = likelihood.score_and_value(params, data, key, config, NAMES, estimator, discount)
         return found.total, found.log_likelihood
 
     return jax.lax.map(one, keys)
@@ -217,10 +217,10 @@ def timed(rounds=7):
         forgetting=False,
     )  # fmt: skip
     params = jax.tree.map(jnp.asarray, default_params("range_bearing", log))
-    data, key = likelihood.data_of(log, config), jax.random.key(0)
+    data, key = likelihood.data_from_log(log, config), jax.random.key(0)
     programs = {"value": likelihood.value.lower(params, data, key, config).compile()}
     for names in (TIMED[:4], TIMED):
-        lowered = likelihood.scored.lower(params, data, key, config, names)
+        lowered = likelihood.score_and_value.lower(params, data, key, config, names)
         programs[f"score of {len(names)}"] = lowered.compile()
     seconds = {name: [] for name in programs}
     for _ in range(rounds):

@@ -25,8 +25,8 @@ import worlds
 from real_logs import MRCLAM_BATCH
 
 from jaxslam import config_for, default_params, load_log, run
-from jaxslam.results.events import UNSURE
-from jaxslam.results.metrics import errors
+from jaxslam.results.events import AMBIGUOUS
+from jaxslam.results.metrics import compute_errors
 
 RESULTS = Path(__file__).parent / "results"
 KEYS = {
@@ -84,10 +84,10 @@ def measure(log, params, seed, particles, config, values):
     params = params._replace(**changed(values))
     config = config_for(log, "bearing", particles=particles, **changed(config))
     result = run(log, config, params, seed)
-    found = errors(result)
+    found = compute_errors(result)
     return {key: found.get(key) for key in KEYS} | {
         "seconds": result.seconds + result.refine_seconds,
-        "ambiguous": int((result.entropy > UNSURE).sum()),
+        "ambiguous": int((result.entropy > AMBIGUOUS).sum()),
         "flags": result.flags,
     }
 

@@ -31,7 +31,7 @@ from jaxslam import config_for, default_params, load_log, run, save_params
 from jaxslam.learning import fit as learn
 from jaxslam.learning import uncertainty
 from jaxslam.logs.slicing import cut, spaced, windows
-from jaxslam.results.metrics import errors
+from jaxslam.results.metrics import compute_errors
 
 RESULTS = Path(__file__).parent / "results"
 PARAMS = Path(__file__).parent / "params"
@@ -118,7 +118,7 @@ def judge(case, params, seeds):
         # What a log declares of its view is its own, whatever was learnt elsewhere.
         own = default_params("range_bearing", log)
         view = {n: getattr(own, n) for n in ("view_min", "view_max", "view_range")}
-        runs = [errors(run(log, config, params._replace(**view), seed)) for seed in seeds]
+        runs = [compute_errors(run(log, config, params._replace(**view), seed)) for seed in seeds]
         found[log.name] = [{key: one.get(key) for key in KEYS} for one in runs]
         means = [f"{key} {np.mean([one[key] for one in runs]):.3f}" for key in KEYS]
         print(f"{case.name} on {log.name}: {', '.join(means)}", flush=True)

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from jaxslam.config import Config, Params, default_params
-from jaxslam.filter.frames import frames
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.learning import fit as learn
 from jaxslam.learning import likelihood, transforms
 from jaxslam.reference import compare, fastslam
@@ -61,10 +61,10 @@ def world(seed):
 
 def likelihood_of(log, params):
     """Log likelihood of a log as a function of free values and a key."""
-    data = likelihood.data_of(log, CONFIG, params)
+    data = likelihood.data_from_log(log, CONFIG, params)
 
     def value(free, key):
-        given = transforms.put(params, NAMES, np.asarray(free, np.float32))
+        given = transforms.with_free(params, NAMES, np.asarray(free, np.float32))
         return float(likelihood.value(Params(*map(jnp.float32, given)), data, key, CONFIG))
 
     return value
@@ -119,8 +119,8 @@ def searched(value, start):
 
 def baseline_seconds(log, params):
     """CPU seconds of the baseline's likelihood of the whole log, from its first `PART` frames."""
-    log = compare.select(log, np.arange(PART))
-    data = frames(log, CONFIG.sensor, CONFIG.measurements, params, True)
+    log = compare.select_frames(log, np.arange(PART))
+    data = frames_from_log(log, CONFIG.sensor, CONFIG.measurements, params, True)
     rng, count = np.random.default_rng(0), CONFIG.particles
     draws = rng.normal(size=(3, count)), rng.normal(size=(PART, 3, count)), rng.uniform(size=PART)
     begin = time.process_time()
@@ -147,8 +147,8 @@ def main():
     began = time.perf_counter(), time.process_time()
     log, other = world(5), world(6)
     truth = default_params(CONFIG.sensor, log)
-    true = transforms.taken(truth, NAMES)
-    start = Params(*map(float, transforms.put(truth, NAMES, true + OFF)))
+    true = transforms.free_vector(truth, NAMES)
+    start = Params(*map(float, transforms.with_free(truth, NAMES, true + OFF)))
     value, held_out = likelihood_of(log, truth), likelihood_of(other, truth)
     of_value = first_call(lambda: value(true, jax.random.key(1)))
     of_score = first_call(lambda: learn.fit([log], CONFIG, start, NAMES, seeds=1, steps=1))

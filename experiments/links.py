@@ -21,11 +21,11 @@ import numpy as np
 import worlds
 
 from jaxslam import config_for, default_params, load_log, run
-from jaxslam.logs.clock_offset import moved
+from jaxslam.logs.clock_offset import shift_frames
 from jaxslam.logs.truth import wrap
 from jaxslam.models.motion import model
-from jaxslam.results.metrics import errors, landmark_gate
-from jaxslam.runs.run import framed
+from jaxslam.results.metrics import compute_errors, landmark_gate
+from jaxslam.runs.run import frames_of
 
 RESULTS = Path(__file__).parent / "results"
 WITHIN = 1.0  # s between two looks at a landmark
@@ -49,7 +49,7 @@ def logs():
 def followed(log, params):
     """Of every bearing whose landmark was seen just before: how far it is from where the odometry
     put it [rad], the turn since [rad], and whether nothing else seen just before is nearer."""
-    data = framed(log, config_for(log, "bearing"), params)
+    data = frames_of(log, config_for(log, "bearing"), params)
     who = np.append(log.identity, -1)[data.row]
     heading = np.cumsum(model(jax.tree.map(np.asarray, data.odometry), params).turn)
     time, bearing = data.time / 1e9, data.measurements.value[..., 0]
@@ -79,7 +79,7 @@ def best_offset(log, params):
     """The offset [s] of the images' stamps with which odometry puts bearings nearest (90 %)."""
 
     def error(offset):
-        return np.quantile(followed(moved(log, offset), params)[0], 0.9)
+        return np.quantile(followed(shift_frames(log, offset), params)[0], 0.9)
 
     return float(min(OFFSETS, key=error))
 
@@ -88,7 +88,7 @@ def by_place(log, params):
     """Landmarks found and all, of a map that was told the identities, paired by place."""
     result = run(log, config_for(log, "bearing", association="known"), params)
     hidden = result.refined._replace(identity=np.full(len(result.refined.identity), -1))
-    found = errors(dataclasses.replace(result, refined=hidden))
+    found = compute_errors(dataclasses.replace(result, refined=hidden))
     return f"{found['landmarks_refined_matched']} of {len(log.truth.landmarks)}"
 
 
@@ -100,7 +100,7 @@ def row(name, log, params):
     gaps, offset = apart(log), best_offset(log, params)
     cells = [name, f"{np.diff(log.view[:2])[0] * 180 / np.pi:.0f}", degrees(gaps, (0.1, 0.5))]
     for at in (0.0, offset):
-        off, turn, right = followed(moved(log, at), params)
+        off, turn, right = followed(shift_frames(log, at), params)
         turning = turn > TURNING
         cells += [f"{at:+.2f}", degrees(off[~turning]), degrees(off[turning])]
         cells += [f"{100 * right.mean():.1f}", f"{100 * right[turning].mean():.1f}"]

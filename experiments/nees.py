@@ -34,10 +34,10 @@ from scipy.stats import chi2
 from jaxslam.config import Config, Params, default_params
 from jaxslam.filter import map_estimate
 from jaxslam.filter import step as fastslam
-from jaxslam.filter.frames import frames
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.truth import wrap
 from jaxslam.simulation.planar import planar
-from jaxslam.smoother.genealogy import Tree, lineage
+from jaxslam.smoother.genealogy import Tree, trace_lineage
 from jaxslam.smoother.refine import refine
 
 RESULTS = Path(__file__).parent / "results"
@@ -91,7 +91,11 @@ def simulated(given, seed):
     params = default_params(given["sensor"], log)._replace(correlation=0.0, caution=0.0)
     if not given["declared_density"]:
         params = params._replace(density_new=default_params().density_new)
-    return log, frames(log, given["sensor"], MOST, params, given["association"] == "known"), params
+    return (
+        log,
+        frames_from_log(log, given["sensor"], MOST, params, given["association"] == "known"),
+        params,
+    )
 
 
 def kept(info):
@@ -99,7 +103,7 @@ def kept(info):
 
 
 def kept_with_past(info):
-    return *kept(info), info.pose, info.birth, info.ancestors
+    return *kept(info), info.pose, info.landmark_id, info.ancestors
 
 
 def filtered(log, data, params, config, seed, keep):
@@ -189,27 +193,27 @@ def one_refined(given, config, seed):
     begin = time.perf_counter()
     log, data, params = simulated(given, seed)
     state, trace, origin = filtered(log, data, params, config, seed, kept_with_past)
-    estimate, _, _, pose, birth, ancestors = trace
+    estimate, _, _, pose, landmark_id, ancestors = trace
     tree = Tree()
-    tree.extend(pose, birth, ancestors)
+    tree.extend(pose, landmark_id, ancestors)
     best = int(np.argmax(ancestors[-1] == estimate.best[-1]))
-    past = lineage(tree, best)
+    past = trace_lineage(tree, best)
     middle = time.perf_counter()
     found = refine(
-        data, past.pose + origin, past.birth, log.start_pose, log.start_cov, params,
+        data, past.pose + origin, past.landmark_id, log.start_pose, log.start_cov, params,
         given["sensor"], config.association == "known",
     )  # fmt: skip
     end = time.perf_counter()
     numbers = jax.tree.map(jnp.asarray, Params(*map(float, params)))
     table = map_estimate.summarise(
-        fastslam.settled(state, config).landmarks, jnp.exp(state.log_weight), best, numbers, config
+        fastslam.settle(state, config).landmarks, jnp.exp(state.log_weight), best, numbers, config
     )
     table = jax.tree.map(np.asarray, table)
     keep = np.flatnonzero(table.kept)
     mean, cov = table.mean[:, keep].T + origin[:2], table.cov[:, keep].T
-    marks, *lost = map_squares(mean, cov, past.birth, table.birth[keep], data, log)
+    marks, *lost = map_squares(mean, cov, past.landmark_id, table.landmark_id[keep], data, log)
     filter_ = *pose_squares(estimate.mean + origin, estimate.cov, log), marks, *lost
-    marks, *lost = map_squares(found.mean, found.landmark_cov, found.match, found.id, data, log)
+    marks, *lost = map_squares(found.mean, found.landmark_cov, found.landmark_id, found.id, data, log)
     refined_ = *pose_squares(found.pose, found.cov, log), marks, *lost
     return filter_, refined_, (middle - begin, end - middle), found.converged
 

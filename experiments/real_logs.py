@@ -23,7 +23,7 @@ import numpy as np
 import worlds
 
 from jaxslam import Log, config_for, load_log, run
-from jaxslam.results.metrics import errors
+from jaxslam.results.metrics import compute_errors
 
 RESULTS = Path(__file__).parent / "results"
 # landmarks by batch with known identities, as measured before this project began [m]
@@ -84,7 +84,11 @@ def measure(case, seed, reference, particles):
     config = config_for(case.log, case.sensor, case.association, particles=count)
     params = batch.gained(case.log, case.file, case.sensor)
     result = run(case.log, config, params, seed)
-    found = errors(result) | {"seed": seed, "seconds": result.seconds, "flags": result.flags}
+    found = compute_errors(result) | {
+        "seed": seed,
+        "seconds": result.seconds,
+        "flags": result.flags,
+    }
     found["refine_seconds"] = result.refine_seconds
     limits = dict(case.limits or {})
     if case.of_batch and reference:

@@ -27,7 +27,7 @@ import numpy as np
 import optax
 
 from jaxslam.config import Config, Params, default_params
-from jaxslam.files import replacing
+from jaxslam.files import atomic_write
 from jaxslam.learning import fit, likelihood, transforms, uncertainty
 from jaxslam.simulation import planar
 
@@ -82,7 +82,7 @@ def problem(case, count):
         [name.startswith("gain") for name in names], 0.2 / transforms.SCALE["gain_rot"], 1.0
     )
     return (
-        fit.stacked(logs, config, params),
+        fit.stack_logs(logs, config, params),
         config,
         params,
         names,
@@ -129,7 +129,7 @@ def climbed(scores, start, saved):
         move, state = adam.update(-jnp.nan_to_num(jnp.asarray(score, jnp.float32)), state)
         past.append(free)
         free = free + np.asarray(move, float)
-        with replacing(saved) as file:
+        with atomic_write(saved) as file:
             leaves = {f"leaf{i}": np.asarray(v) for i, v in enumerate(jax.tree.leaves(state))}
             np.savez(file, past=np.array(past), free=free, **leaves)
         spent = time.perf_counter() - begin
@@ -150,18 +150,21 @@ def assessed(scores, free):
             free = free + stepped(outers, found)
     curves = slopes(scores, free, outers)
     slope = np.array([one[0] for one in curves])
-    parts = [uncertainty.combined(outer, *one) for outer, one in zip(outers, curves, strict=True)]
+    parts = [
+        uncertainty.combine_covariances(outer, *one)
+        for outer, one in zip(outers, curves, strict=True)
+    ]
     covariance = np.array([part[0] for part in parts])
     used = np.array(
         [o if part[2] == "outer" else (o + s) / 2
          for o, s, part in zip(outers, slope, parts, strict=True)]
     )  # fmt: skip
     noise = [np.cov(totals.T) / len(totals) for totals in found.total]
-    inverse = [uncertainty.inverted(information) for information in used]
+    inverse = [uncertainty.invert(information) for information in used]
     carlo = np.array([i @ n @ i for i, n in zip(inverse, noise, strict=True)])
     statistical, carlo = (np.sqrt(np.einsum("lpp->lp", m)) for m in (covariance, carlo))
     by = {"outer": outers, "curvature": slope}
-    others = {k: np.sqrt([np.diag(uncertainty.inverted(m)) for m in v]) for k, v in by.items()}
+    others = {k: np.sqrt([np.diag(uncertainty.invert(m)) for m in v]) for k, v in by.items()}
     others = {k: np.hypot(error, carlo) for k, error in others.items()}
     others["no Monte-Carlo part"] = statistical
     return free + stepped(used, found), np.hypot(statistical, carlo), parts, found, others
@@ -175,7 +178,7 @@ def outers_of(found):
 def stepped(information, found):
     """Newton's steps [L, P]."""
     means = found.total.mean(1)
-    return np.array([uncertainty.newton(*one) for one in zip(information, means, strict=True)])
+    return np.array([uncertainty.newton_step(*one) for one in zip(information, means, strict=True)])
 
 
 def slopes(scores, free, outers):
@@ -188,7 +191,7 @@ def slopes(scores, free, outers):
         sides.append([scores(free + sign * step, SEEDS, 1).total for sign in (-1, 1)])
         print(f"slope {i + 1}/{free.shape[1]}", file=sys.stderr, flush=True)
     low, high = np.moveaxis(np.array(sides), (1, 2), (0, 1))  # [2, L, P, S, P]
-    return [uncertainty.curved(*one) for one in zip(low, high, widths, strict=True)]
+    return [uncertainty.curvature_at(*one) for one in zip(low, high, widths, strict=True)]
 
 
 def main():

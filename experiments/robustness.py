@@ -16,7 +16,7 @@ import numpy as np
 import worlds
 
 from jaxslam import config_for, default_params, load_log, run
-from jaxslam.results.metrics import errors
+from jaxslam.results.metrics import compute_errors
 
 RESULTS = Path(__file__).parent / "results"
 NOISES = ("sigma_bearing", "growth", "correlation", "outlier", "err_tran", "err_rot", "err_drift")
@@ -40,7 +40,7 @@ def variants(params):
 def worst(log, params, particles, seeds):
     """The largest error of each kind over the seeds [m]; infinite where a run found none."""
     config = config_for(log, "bearing", "known", particles=particles, proposal="informed")
-    found = [errors(run(log, config, params, seed)) for seed in seeds]
+    found = [compute_errors(run(log, config, params, seed)) for seed in seeds]
     return {key: max(each.get(key, np.inf) for each in found) for key in COLUMNS}
 
 

@@ -126,7 +126,7 @@ def score(result, seed, log):
         world = result.landmarks_refined
         found |= _of_stage("refined", result.refined.pose, world, true, seed, log)
         found["refine_seconds"] = result.refine_seconds
-        found["association"] = association_accuracy(result, log, result.refined.match)
+        found["association"] = association_accuracy(result, log, result.refined.landmark_id)
     return found
 
 

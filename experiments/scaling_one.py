@@ -29,7 +29,7 @@ import numpy as np
 from jaxslam.config import Config
 from jaxslam.filter import step as fastslam
 from jaxslam.runs import memory
-from jaxslam.runs.memory import available
+from jaxslam.runs.memory import available_bytes
 
 C_FOLDER = Path(__file__).resolve().parents[2] / "shared" / "bench"
 C_FLAGS = "-Ofast -march=native -mprefer-vector-width=512 -fopenmp-simd"
@@ -60,7 +60,7 @@ def config_of(given):
 def needed(config, who="jaxslam"):
     """Bytes of `State`, and at most needed for a run."""
     state = jax.eval_shape(lambda: fastslam.init(config, jax.random.key(0)))
-    size = memory.of_arrays(state)
+    size = memory.bytes_of(state)
     if who != "jaxslam":  # a second map while resampling; NumPy all at once: tables
         n, m, k = config.particles, config.landmarks, config.measurements
         tables = 6 * 4 * n * m * k if who == "numpy" and config.association != "known" else 0
@@ -73,8 +73,8 @@ def refusal(given):
     if given["who"] == "loop":
         return None
     _, need = needed(config_of(given | {"devices": 1}), given["who"])
-    if need > available():
-        return f"does not fit: needs {need / 1e9:.1f} GB, {available() / 1e9:.1f} GB are free"
+    if need > available_bytes():
+        return f"does not fit: needs {need / 1e9:.1f} GB, {available_bytes() / 1e9:.1f} GB are free"
     return None
 
 

@@ -54,7 +54,7 @@ def estimate(name, log, params, particles, seed):
     if not name.startswith("jaxslam"):
         rule = "known" if name == "ekf known" else name
         found = rivals.run(log, params, rule)
-        stage = found.pose, found.row, found.match, found.mean, found.identity
+        stage = found.pose, found.row, found.landmark_id, found.mean, found.identity
         return {"filtered": stage}, {"cut": found.cut}
     settings = dict(particles=particles, measurements=world.MOST)
     if name == "jaxslam known":
@@ -64,9 +64,9 @@ def estimate(name, log, params, particles, seed):
     marks, stages = result.landmarks, {}
     if result.refined is not None:
         again = result.landmarks_refined
-        path = result.refined.pose, result.row, result.refined.match
+        path = result.refined.pose, result.row, result.refined.landmark_id
         stages["refined"] = (*path, again.mean, again.identity)
-    stages["filtered"] = (result.pose, result.row, result.match, marks.mean, marks.identity)
+    stages["filtered"] = (result.pose, result.row, result.landmark_id, marks.mean, marks.identity)
     # with known identities clutter is left out by design
     return stages, {"flags": [flag for flag in result.flags if not flag.endswith(": no identity")]}
 
@@ -87,7 +87,7 @@ def measures(log, pose, row, match, mean, identity):
     true = metrics.truth_at(truth, log.frame_time)
     motion = metrics.align_se2(pose[:, :2], true[:, :2])
     found = metrics.map_error(mean, identity, truth, motion)
-    given = SimpleNamespace(log=log, row=row, match=match)
+    given = SimpleNamespace(log=log, row=row, landmark_id=match)
     label = np.where(taken == -1, np.arange(taken.size), taken)
     told = dict(
         right=metrics.association_accuracy(given, log),

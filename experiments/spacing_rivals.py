@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from jaxslam.filter.frames import frames
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.odometry import moments
 
 GATE = 0.95  # of chi-squared: what is compatible
@@ -80,7 +80,7 @@ class Predicted(NamedTuple):
 
 def run(log, params, rule):
     """`Estimate` of a whole log; `rule`: "nearest", "joint" or "known"."""
-    data = frames(log, "bearing", params=params, known=rule == "known")
+    data = frames_from_log(log, "bearing", params=params, known=rule == "known")
     z, valid = np.asarray(data.measurements.value)[:, :, 0], np.asarray(data.measurements.valid)
     moves, move_covs = moments(data.odometry, params)
     moves[:, :2] *= params.gain_tran

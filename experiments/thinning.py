@@ -21,7 +21,7 @@ import numpy as np
 
 from jaxslam.config import Config, Params, default_params
 from jaxslam.filter import step as fastslam
-from jaxslam.filter.frames import frames
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.simulation.planar import planar
 
 RESULTS = Path(__file__).parent / "results"
@@ -73,7 +73,9 @@ def steps(log, rate, config, params):
         time = np.union1d(time, ticks.astype(np.int64))
     frame = np.searchsorted(time, log.frame_time)[log.frame]
     more = dataclasses.replace(log, frame_time=time, frame=frame, truth=None)
-    data = frames(more, config.sensor, config.measurements, params, config.association == "known")
+    data = frames_from_log(
+        more, config.sensor, config.measurements, params, config.association == "known"
+    )
     active = np.isin(time, log.frame_time)
     return data.odometry, data.measurements._replace(active=active)
 

@@ -57,7 +57,8 @@ def __getattr__(name):
         return importlib.import_module(f"jaxslam.{_MODULES[name]}")
     if name not in _WHERE:
         raise AttributeError(f"module 'jaxslam' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"jaxslam.{_WHERE[name]}"), name)
+    module = importlib.import_module(f"jaxslam.{_WHERE[name]}")
+    return getattr(module, "compute_errors" if name == "errors" else name)
 
 
 def __dir__():

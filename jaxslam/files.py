@@ -11,7 +11,7 @@ NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 
 
 @contextmanager
-def replacing(path):
+def atomic_write(path):
     """A binary file that becomes `path` once it is written and on the disk.
 
     Whatever goes wrong, the old file stays and nothing is left beside it. Raises `ValueError` where
@@ -35,7 +35,7 @@ def replacing(path):
 
 def move_folder(partial, target, overwrite):
     """Rename the folder `partial` to `target`, with `overwrite` in place of one that is there."""
-    old = beside(target) if overwrite and target.exists() else None
+    old = temporary_sibling(target) if overwrite and target.exists() else None
     if old:
         os.rename(target, old)
     try:
@@ -44,17 +44,17 @@ def move_folder(partial, target, overwrite):
         if old:
             os.rename(old, target)
         raise
-    sync(target.parent)
+    fsync_all(target.parent)
     if old:
         shutil.rmtree(old, ignore_errors=True)
 
 
-def beside(target):
+def temporary_sibling(target):
     """A name nobody uses, in the same folder, so that renaming it to `target` is one step."""
     return target.with_name(f".{target.name}.{token_hex(4)}")
 
 
-def sync(*paths):
+def fsync_all(*paths):
     """See files or folders onto the disk."""
     for path in paths:
         handle = os.open(path, os.O_RDONLY)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxslam.config import UNITS, Params
-from jaxslam.files import replacing
+from jaxslam.files import atomic_write
 
 MEANING = {
     "err_tran": "noise along the path, per distance",
@@ -205,7 +205,7 @@ def save_params(path, params, standard_errors=None, learning=None):
             lines.append(f"{name} = {_number(path, f'{ERRORS}.{name}', value)!r}\n")
     if learning is not None:
         lines += _learning_lines(path, learning)
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         file.write("".join(lines).encode())
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from jaxslam.files import replacing
+from jaxslam.files import atomic_write
 
 DPI = 150
 
@@ -44,6 +44,6 @@ def ellipses(mean, cov, sigmas=3.0, corners=49):
 def write_figure(figure, path):
     """Save a figure as PNG, whole or not at all."""
     FigureCanvasAgg(figure)
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         figure.savefig(file, format="png", dpi=DPI, bbox_inches="tight", pad_inches=0.12)
     return path

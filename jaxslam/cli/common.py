@@ -16,11 +16,11 @@ def option(kind, text):
     return Annotated[kind, Parameter(help=text, show_default=False if kind is bool else None)]
 
 
-def whole(text, least=1, most=10**9):
+def at_least(text, least=1, most=10**9):
     return Annotated[int, Parameter(help=text, validator=Number(gte=least, lte=most))]
 
 
-Seed = whole("of the random draws: the same seed, the same run", 0, 2**32 - 1)
+Seed = at_least("of the random draws: the same seed, the same run", 0, 2**32 - 1)
 LogName = option(str, f"a .npz file, or {DEMO}")
 Overwrite = option(bool, "replace what is there")
 Sensors = Literal["range_bearing", "position", "bearing"]

@@ -18,12 +18,12 @@ from jaxslam.cli.common import (
     Seed,
     Sensor,
     Start,
+    at_least,
     bar,
     check_new,
     note,
     option,
     warn,
-    whole,
 )
 from jaxslam.config import ASSOCIATIONS
 
@@ -47,8 +47,8 @@ def learn(
     ) = "sampled",
     params: option(Path, "TOML file: starting values, and [learn], [bounds], [prior]")
     | None = None,
-    particles: whole("how many hypotheses of the path") = 200,
-    landmarks: whole("slots of the map (64; known: one each)") | None = None,
+    particles: at_least("how many hypotheses of the path") = 200,
+    landmarks: at_least("slots of the map (64; known: one each)") | None = None,
     window: option(float, "logs are learnt in pieces so long [s] (0: whole)") = 60.0,
     spacing: option(
         float, "use frames at least so far apart [s]: errors of close ones are alike"
@@ -57,8 +57,8 @@ def learn(
     end: End = None,
     held_out_start: Start = 0.0,
     held_out_end: End = None,
-    seeds: whole("per log and step", 2) = 4,
-    steps: whole("at most") = 150,
+    seeds: at_least("per log and step", 2) = 4,
+    steps: at_least("at most") = 150,
     surface: option(str, "draw the likelihood over two parameters, like err_rot,err_drift")
     | None = None,
     compare_models: option(bool, "say which sensor error model the held-out logs prefer") = False,
@@ -92,10 +92,10 @@ def learn(
         task = _task(train, config, params, parameters)
         pair = _pair(surface, task.names)
     out.parent.mkdir(parents=True, exist_ok=True)
-    fit = _fitted(train, judges, config, task, seeds, steps, seed, files, resume)
-    fit, errors, judged = _assessed(fit, train, judges, seed)
+    fit = _run_fit(train, judges, config, task, seeds, steps, seed, files, resume)
+    fit, errors, judged = _assess(fit, train, judges, seed)
     _write(fit, errors, task, files)
-    found = _told(fit, errors, judged, dropped, files)
+    found = _print_fit(fit, errors, judged, dropped, files)
     if pair:
         _draw_surface(train, fit, errors, pair, files["surface"], seed)
     if compare_models:
@@ -174,7 +174,7 @@ def _config(parts, sensor, association, particles, landmarks):
     """A `Config` with room for every part, and how many measurements it has no use for, by why."""
     import dataclasses
 
-    from jaxslam.filter.frames import frames
+    from jaxslam.filter.frames import frames_from_log
     from jaxslam.runs.run import config_for
 
     # Else doubles of landmarks would pay, and noise be learnt too small.
@@ -189,7 +189,9 @@ def _config(parts, sensor, association, particles, landmarks):
     )
     dropped = {}
     for part in parts:
-        found = frames(part, config.sensor, config.measurements, None, association == "known")
+        found = frames_from_log(
+            part, config.sensor, config.measurements, None, association == "known"
+        )
         for why, count in found.dropped.items():
             dropped[why] = dropped.get(why, 0) + count
     return config, dropped
@@ -215,13 +217,13 @@ def _task(train, config, path, parameters):
         names = tuple(n for n in names if getattr(start, n) > 0 or n in transforms.LINEAR)
     if len(set(names)) < len(names):
         raise ValueError(f"--parameters: {', '.join(names)}; name each once")
-    with _bias_told_later():
+    with _without_clip_warning():
         likelihood.check(config, names=names)
     if "sigma_bearing" in names and start.caution:
         note(f"caution, {start.caution:g} rad, becomes a part of sigma_bearing: it is learnt")
         both = (start.sigma_bearing**2 + start.caution**2) ** 0.5
         start = start._replace(sigma_bearing=both, caution=0.0)
-    transforms.taken(start, names)  # refuses a start at 0
+    transforms.free_vector(start, names)  # refuses a start at 0
     mine = [
         {name: pair for name, pair in pairs.items() if name in names}
         for pairs in (told.bounds, told.priors)
@@ -239,12 +241,12 @@ def _pair(text, names):
     return pair
 
 
-def _fitted(train, judges, config, task, seeds, steps, seed, files, resume):
+def _run_fit(train, judges, config, task, seeds, steps, seed, files, resume):
     """The fit; a stopped one says how to go on."""
     from jaxslam.learning.fit import fit
 
     try:
-        with _telling("learning") as progress, _bias_told_later():
+        with _progress_printer("learning") as progress, _without_clip_warning():
             return fit(
                 train, config, task.params, task.names, judges, task.bounds, task.priors,
                 seeds=seeds, steps=steps, seed=seed, checkpoint=files["checkpoint"],
@@ -257,7 +259,7 @@ def _fitted(train, judges, config, task, seeds, steps, seed, files, resume):
 
 
 @contextmanager
-def _bias_told_later():
+def _without_clip_warning():
     """No warning of Python's about an association that biases: a line says so in the end."""
     from jaxslam.learning.likelihood import BIASED
 
@@ -267,7 +269,7 @@ def _bias_told_later():
 
 
 @contextmanager
-def _telling(what):
+def _progress_printer(what):
     """A function for the progress of a fit: a bar, or a line now and then."""
     with bar(what, compiles=True) as show:
         if show:
@@ -286,15 +288,15 @@ def _telling(what):
         yield tell
 
 
-def _assessed(fit, train, judges, seed):
+def _assess(fit, train, judges, seed):
     """The fit after a last Newton step, its `Uncertainty`, and what held-out logs say (or None)."""
     from jaxslam.learning.fit import evidence
     from jaxslam.learning.report import Judged
-    from jaxslam.learning.uncertainty import assess, improved
+    from jaxslam.learning.uncertainty import assess, improve
 
     with bar("standard errors", compiles=True):
         errors = assess(fit, train, seed=seed + 1)
-    fit = improved(fit, errors)
+    fit = improve(fit, errors)
     if not judges:
         return fit, errors, None
     with bar("judging", compiles=True):
@@ -329,12 +331,12 @@ def _draw_surface(train, fit, errors, pair, path, seed):
     print(path)
 
 
-def _told(fit, errors, judged, dropped, files):
+def _print_fit(fit, errors, judged, dropped, files):
     """Print what was found; whether there were warnings."""
     from jaxslam.learning import report as learn_report
 
     print(learn_report.table(fit, errors))
-    for line in learn_report.sentences(fit, errors, judged):
+    for line in learn_report.describe(fit, errors, judged):
         print(line)
     print(files["csv"], files["figure"], files["params"], sep="\n")
     print(f"map with it: jaxslam run LOG --sensor {fit.config.sensor} --params {files['params']}")
@@ -351,7 +353,7 @@ def _models(train, judges, fit, seeds, steps, seed):
     """Print which sensor error model the held-out logs prefer; whether something went wrong."""
     from jaxslam.learning import error_models
 
-    with bar("error models", compiles=True) as progress, _bias_told_later():
+    with bar("error models", compiles=True) as progress, _without_clip_warning():
         rows = error_models.compare(
             train, judges, fit.config, fit.params, fit.names, seeds, steps, seed, progress
         )

@@ -24,11 +24,11 @@ from jaxslam.cli.common import (
     Seed,
     Sensor,
     Start,
+    at_least,
     bar,
     check_new,
     option,
     warn,
-    whole,
 )
 from jaxslam.config import ASSOCIATIONS, PROPOSALS
 from jaxslam.files import NO_SPACE
@@ -95,12 +95,12 @@ def run(
     sensor: Sensor = None,
     association: Association = "maximum_likelihood",
     proposal: Proposal = None,
-    particles: whole("how many hypotheses of the path") = 1000,
-    landmarks: whole("slots of the map (64; known: one each)") | None = None,
+    particles: at_least("how many hypotheses of the path") = 1000,
+    landmarks: at_least("slots of the map (64; known: one each)") | None = None,
     params: ParamFile = None,
     paper: Paper = False,
     rejuvenate: option(float, REJUVENATED) | None = None,
-    descriptors: whole(LOOKS, 0) | None = None,
+    descriptors: at_least(LOOKS, 0) | None = None,
     start: Start = 0.0,
     end: End = None,
     no_refine: option(bool, "only filter: path and map are not refined afterwards") = False,
@@ -111,10 +111,10 @@ def run(
     resume: option(bool, "go on with a run that was interrupted or killed (every 60s)") = False,
     seeds: option(str, "several runs in one program, like 0-9 or 1,4,7-9: a table") | None = None,
     sweep: option(tuple[str, ...], "and for these values, like err_rot=0.05,0.1 (repeat)") = (),
-    devices: whole("of this process, that share the particles (or the runs of --seeds)") = 1,
+    devices: at_least("of this process, that share the particles (or the runs of --seeds)") = 1,
     coordinator: option(str, HOST_PORT) | None = None,
-    num_processes: whole("processes that share the run (Slurm, Open MPI say)") | None = None,
-    process_id: whole("which of them this is; 0 alone writes and speaks", 0) | None = None,
+    num_processes: at_least("processes that share the run (Slurm, Open MPI say)") | None = None,
+    process_id: at_least("which of them this is; 0 alone writes and speaks", 0) | None = None,
 ):
     """Filter a log, then refine: trajectory, map, figures and errors in a folder.
 
@@ -126,9 +126,9 @@ def run(
 
     Example: jaxslam run lost-in-the-woods --particles 2000 --out runs/woods
     """
-    place = cluster.place(coordinator, num_processes, process_id)
+    place = cluster.find_address(coordinator, num_processes, process_id)
     if place and place.process:
-        supervisor.go_on_watched()
+        supervisor.run_supervised()
     with bar("reading", shown=place is None or place.process == 0):
         from jaxslam.logs.log_file import load_log
         from jaxslam.logs.slicing import cut
@@ -139,14 +139,18 @@ def run(
     if many and (checkpoint_every or resume or place):
         raise ValueError("--seeds and --sweep are for small runs: without checkpoints, one process")
     total = 1 if many else devices * (place.processes if place else 1)
-    model = cli_run.model(
+    model = cli_run.build_model(
         loaded, sensor, association, particles, landmarks, params, paper, proposal, total,
         rejuvenate, descriptors,
     )  # fmt: skip
     name = seed if seeds is None else f"seeds-{seeds}"
     out = out or Path("runs") / f"{Path(log).stem}-{model[0].sensor}-{name}"
     cli_run.use_devices(devices)
-    long = cli_run.Long(checkpoint_every or "60s", resume) if checkpoint_every or resume else None
+    long = (
+        cli_run.CheckpointOptions(checkpoint_every or "60s", resume)
+        if checkpoint_every or resume
+        else None
+    )
     task = cli_run.Task(
         loaded, *model, seed, out, log, part, overwrite, no_refine, long, shared=place is not None
     )
@@ -169,9 +173,9 @@ def compare(
     params: ParamFile = None,
     paper: Paper = False,
     particles: option(str, "particle counts of the baseline, by commas") = "20,100",
-    variants: whole("particles of the second table's filters (0: no table)", 0) = 1000,
-    steps: whole("frames to filter") = 200,
-    every: whole("use each n-th frame (the steps cover a tenth)") | None = None,
+    variants: at_least("particles of the second table's filters (0: no table)", 0) = 1000,
+    steps: at_least("frames to filter") = 200,
+    every: at_least("use each n-th frame (the steps cover a tenth)") | None = None,
     seed: Seed = 0,
 ):
     """Show the filter beside the plain NumPy baseline: agreement, accuracy, time.
@@ -190,7 +194,7 @@ def compare(
         loaded = load_log(log)
     rows = []
     for count in counts:
-        model = cli_run.model(loaded, sensor, association, count, None, params, paper)
+        model = cli_run.build_model(loaded, sensor, association, count, None, params, paper)
         with bar(f"{count} particles", compiles=True) as progress:
             rows.append(sides.compare(loaded, *model, seed, steps, every, progress))
     print(sides.table(rows))
@@ -198,7 +202,7 @@ def compare(
         from jaxslam.reference import variants as rules
 
         with bar("variants", compiles=True) as progress:
-            model = cli_run.model(loaded, sensor, association, variants, None, params, paper)
+            model = cli_run.build_model(loaded, sensor, association, variants, None, params, paper)
             found = rules.variants(loaded, *model, seed, steps, every, rows, progress)
         print(f"\n{rules.table(found)}")
     parted = [row.double for row in rows if row.double.same < row.double.steps]
@@ -210,7 +214,7 @@ def compare(
 @app.command(usage="Usage: jaxslam convert [OPTIONS] SRC... OUT.npz")
 def convert(
     *paths: option(Path, "files or folder to read, then the log to write"),
-    robot: whole("which robot of an MRCLAM folder") | None = None,
+    robot: at_least("which robot of an MRCLAM folder") | None = None,
     time_offset: option(float, "seconds to move the frames by, as check says") = 0.0,
     overwrite: Overwrite = False,
 ):
@@ -222,7 +226,7 @@ def convert(
 
     Example: jaxslam convert odometry.csv measurements.csv OUT.npz
     """
-    from jaxslam.logs.clock_offset import moved
+    from jaxslam.logs.clock_offset import shift_frames
     from jaxslam.logs.log import NOT_USED
     from jaxslam.logs.log_file import save_log
     from jaxslam.logs.readers import read
@@ -232,7 +236,7 @@ def convert(
     *sources, out = paths
     check_new(out, overwrite)
     with bar("reading"):
-        log = moved(read(sources, robot), time_offset)
+        log = shift_frames(read(sources, robot), time_offset)
     save_log(out, log)
     print(f"{out}: {log}; look at it with: jaxslam check {out}")
     lost = {why: n for why, n in log.skipped.items() if not why.startswith(NOT_USED)}
@@ -293,7 +297,7 @@ def planar(
     *,
     world: option(Worlds, "landmarks on the walls of 10 x 4 m, on a grid, or scattered") = "room",
     seed: Seed = 0,
-    landmarks: whole("point landmarks") = 40,
+    landmarks: at_least("point landmarks") = 40,
     length: option(float, "of the path [m]") = 60.0,
     speed: option(float, "[m/s]") = 0.5,
     rate: option(float, "frames per second [Hz]") = 5.0,

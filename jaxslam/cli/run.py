@@ -13,7 +13,7 @@ from jaxslam.runs import cluster
 FAULT = 70  # exit code of a process that fails by a fault of ours, told to the others
 
 
-class Long(NamedTuple):
+class CheckpointOptions(NamedTuple):
     """Options of a run that is put aside: `every` so often, as text; `resume`: go on with it."""
 
     every: str
@@ -33,7 +33,7 @@ class Task(NamedTuple):
     part: bool
     overwrite: bool
     no_refine: bool
-    long: Long | None
+    long: CheckpointOptions | None
     shared: bool
 
     @property
@@ -41,7 +41,7 @@ class Task(NamedTuple):
         return None if self.part else self.name
 
 
-def model(
+def build_model(
     log, sensor, association, particles, landmarks, params, paper, proposal=None, devices=1,
     rejuvenate=None, descriptors=None,
 ):  # fmt: skip
@@ -73,13 +73,13 @@ def model(
     return config, load_params(params, base) if params else base
 
 
-def filtered(task, checkpoints=None):
+def run_filter(task, checkpoints=None):
     """A run's result; with progress bars."""
     from jaxslam.runs import run
 
     with (
         bar("filtering", compiles=True) as progress,
-        cluster.quiet() if task.shared else nullcontext(),
+        cluster.silence_stderr() if task.shared else nullcontext(),
     ):
         result = run.run(
             task.log,
@@ -93,7 +93,7 @@ def filtered(task, checkpoints=None):
     if task.no_refine:
         return result
     with bar("refining") as progress:
-        return run.refined(result, progress)
+        return run.refine_result(result, progress)
 
 
 def use_devices(count):
@@ -116,10 +116,10 @@ def _run_short(task):
     from jaxslam.results import run_folder
 
     run_folder.check_target(task.out, task.overwrite)
-    result = filtered(task)
+    result = run_filter(task)
     with bar("writing"):
         run_folder.save(result, task.out, task.overwrite, log_source=task.source)
-    told(result, task.out)
+    print_summary(result, task.out)
     return result
 
 
@@ -129,7 +129,7 @@ def _run_long(task):
     from jaxslam.runs import checkpoints as offline
 
     out, overwrite, (every, resume) = task.out, task.overwrite, task.long
-    every = offline.seconds(every)
+    every = offline.parse_interval(every)
     if overwrite and resume:
         raise ValueError("--resume goes on with a run, --overwrite replaces it; choose one")
     _check_beside(task)
@@ -138,11 +138,11 @@ def _run_long(task):
             offline.check_finished(out, task.log, task.config, task.params, task.seed)
             print(f"{out}: is finished already; nothing to do")
             return None
-        result = filtered(task, checkpoints)
+        result = run_filter(task, checkpoints)
         with bar("writing"):
-            run_folder.finish(result, out, log_source=task.source)
+            run_folder.save_into(result, out, log_source=task.source)
         checkpoints.clear()
-    told(result, out)
+    print_summary(result, out)
     return result
 
 
@@ -160,14 +160,14 @@ def run_shared(task, place, guarded):
     from jaxslam.runs import checkpoints as offline
 
     run = {
-        **offline.told(task.log, task.config, task.params, task.seed),
+        **offline.run_fingerprint(task.log, task.config, task.params, task.seed),
         "devices": task.config.devices,
         "out": str(task.out),
         "long": str(task.long),
         "refined": not task.no_refine,
         "versions": run_folder.versions(),
     }
-    team = cluster.Team(place, cluster.meet(place, run))
+    team = cluster.Team(place, cluster.rendezvous(place, run))
     code = FAULT
     try:
         code = guarded(lambda: _share(task, place, team))
@@ -185,8 +185,8 @@ def _share(task, place, team):
         cluster.connect(place)
         if team.leads:
             return run(task)
-        follow = offline.Followed(task.out, team.wait) if task.long else None
-        with cluster.quiet():
+        follow = offline.FollowerCheckpoints(task.out, team.wait) if task.long else None
+        with cluster.silence_stderr():
             run.run(task.log, task.config, task.params, task.seed, refine=False, checkpoints=follow)
         team.wait()
     except RuntimeError as error:
@@ -196,7 +196,7 @@ def _share(task, place, team):
         raise ConnectionError("the connection to another process broke") from None
 
 
-def told(result, out):
+def print_summary(result, out):
     """Print what a run found, its advice and its warnings."""
     from jaxslam.results import run_folder
     from jaxslam.results.tables import error_table
@@ -216,14 +216,16 @@ def run_many(task, seeds, sweep, devices):
     """A table of runs, with a folder for each; the exit code."""
     from jaxslam.runs import batch
 
-    todo = batch.tasks(seeds, task.params, sweep)
+    todo = batch.plan_tasks(seeds, task.params, sweep)
     _check_beside(task)
     batch.check_target(task.out, task.overwrite)
     with bar("running", compiles=True) as progress:
-        results = batch.run(task.log, task.config, todo, progress, not task.no_refine, devices)
+        results = batch.run_tasks(
+            task.log, task.config, todo, progress, not task.no_refine, devices
+        )
     with bar("writing"):
         batch.save(todo, results, task.out, task.overwrite, task.source)
-    print(batch.table(batch.rows(todo, results)))
+    print(batch.table(batch.summary_rows(todo, results)))
     print(f"{task.out}: the table is {task.out / batch.TABLE}, with a folder for each run")
     for line in dict.fromkeys(line for result in results for line in result.flags):
         warn(line)

@@ -13,19 +13,19 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.filter.association import NEW
-from jaxslam.filter.xla import added, pinned
+from jaxslam.filter.xla import barrier, ordered_sum
 
 CHANGED = 0.1  # probability that a landmark looks like any other: something else is behind it
 LATEST = 8.0  # sightings that a look is the mean of, at most: light and background change
 
 
-class Looks(NamedTuple):
-    """Of every slot: the `mean` [J, M] coordinates of the landmark with this `birth` [M], and their
+class Appearances(NamedTuple):
+    """Of every slot: the `mean` [J, M] coordinates of the landmark with this `landmark_id` [M], and their
     `weight` [M], the sightings it is the mean of (0: none)."""
 
     mean: jax.Array
     weight: jax.Array
-    birth: jax.Array
+    landmark_id: jax.Array
 
 
 def empty(config, dtype):
@@ -34,10 +34,10 @@ def empty(config, dtype):
         return None
     slots = config.landmarks
     mean = jnp.zeros((config.descriptors, slots), dtype)
-    return Looks(mean, jnp.zeros(slots, dtype), jnp.full(slots, -1, jnp.int32))
+    return Appearances(mean, jnp.zeros(slots, dtype), jnp.full(slots, -1, jnp.int32))
 
 
-def gain(looks, measurements):
+def log_likelihood_ratio(looks, measurements):
     """Log likelihood ratios [K, M]: of the measurements' looks under every slot over that under
     none."""
     found = measurements.descriptor[:, :, None]
@@ -47,41 +47,41 @@ def gain(looks, measurements):
     centre = looks.mean * (looks.weight / own) / precision
     variance = own + 1 / precision
     parts = found**2 - (found - centre) ** 2 / variance - jnp.log(variance)
-    ratio = 0.5 * added(jnp.moveaxis(parts, 1, 0))
-    return pinned(jnp.logaddexp(jnp.log1p(-CHANGED) + ratio, jnp.log(CHANGED)))
+    ratio = 0.5 * ordered_sum(jnp.moveaxis(parts, 1, 0))
+    return barrier(jnp.logaddexp(jnp.log1p(-CHANGED) + ratio, jnp.log(CHANGED)))
 
 
-def learnt(looks, match, birth, free, number, measurements):
+def update_appearances(looks, match, landmark_id, free, number, measurements):
     """`Looks` after a frame: of the best particle's slots `match` [K] (negative: none), and the
-    `birth` [K] of what is in them. What is new has taken the slots `free` [K], in order, in the
+    `landmark_id` [K] of what is in them. What is new has taken the slots `free` [K], in order, in the
     step of this `number` (`births.create`)."""
     new, total = (match == NEW) & measurements.valid, len(match)
     nth = jnp.cumsum(new) - 1
     match = jnp.where(new, free[jnp.maximum(nth, 0)], match)
-    birth = jnp.where(new, number * total + jnp.arange(total), birth)
+    landmark_id = jnp.where(new, number * total + jnp.arange(total), landmark_id)
     here = (match[:, None] == jnp.arange(looks.mean.shape[1])) & measurements.valid[:, None]
-    born = jnp.where(here, birth[:, None], -(2**31)).max(0)
+    born = jnp.where(here, landmark_id[:, None], -(2**31)).max(0)
     seen = here.any(0)
-    weight = jnp.where(seen & (born != looks.birth), 0.0, looks.weight)
-    more = added(here.astype(weight.dtype))
-    total = added(here[:, None] * measurements.descriptor[:, :, None])
+    weight = jnp.where(seen & (born != looks.landmark_id), 0.0, looks.weight)
+    more = ordered_sum(here.astype(weight.dtype))
+    total = ordered_sum(here[:, None] * measurements.descriptor[:, :, None])
     mean = (weight * looks.mean + total) / jnp.maximum(weight + more, 1.0)
-    return Looks(
-        pinned(jnp.where(seen, mean, looks.mean)),
-        pinned(jnp.minimum(weight + more, LATEST)),
-        jnp.where(seen, born, looks.birth),
+    return Appearances(
+        barrier(jnp.where(seen, mean, looks.mean)),
+        barrier(jnp.minimum(weight + more, LATEST)),
+        jnp.where(seen, born, looks.landmark_id),
     )
 
 
-def without(looks, slots):
+def clear_slots(looks, slots):
     """`Looks` with nothing of these slots [M], where there are new landmarks."""
     return looks._replace(weight=jnp.where(slots, 0.0, looks.weight))
 
 
-def moved(looks, birth):
+def reorder_slots(looks, landmark_id):
     """`Looks` of a map whose slots hold the landmarks of these births [M]; those not found begin
     anew."""
-    same = (birth[:, None] == looks.birth) & (looks.weight > 0)
+    same = (landmark_id[:, None] == looks.landmark_id) & (looks.weight > 0)
     at = jnp.argmax(same, 1)
     weight = jnp.where(same.any(1), looks.weight[at], 0.0)
-    return Looks(looks.mean[:, at], weight, birth.astype(jnp.int32))
+    return Appearances(looks.mean[:, at], weight, landmark_id.astype(jnp.int32))

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from jaxslam.filter.landmarks import score
-from jaxslam.filter.xla import added, listed
+from jaxslam.filter.landmarks import log_likelihoods
+from jaxslam.filter.xla import nonzero_indices, ordered_sum
 from jaxslam.models.geometry import wrap
 
 NEW, CLUTTER, PADDING = -1, -2, -3
@@ -31,9 +31,9 @@ def associate(config, scorer, measurements, new, clutter, params, picks=None, al
     log_choice = jnp.zeros_like(scorer.constant[0])
     if config.association == "sampled":
         given = measurements, new, clutter, params, picks, alike
-        slot, log_choice = _sampled(config, scorer, *given)
+        slot, log_choice = _sample(config, scorer, *given)
     elif config.association == "known":
-        slot, log_choice = _known(config, scorer, measurements, clutter, params, picks)
+        slot, log_choice = _take_known(config, scorer, measurements, clutter, params, picks)
     else:
         # Padding wants no landmark, so that it takes none from a measurement.
         threshold = jnp.where(measurements.valid, jnp.maximum(new, clutter), jnp.inf)
@@ -43,7 +43,7 @@ def associate(config, scorer, measurements, new, clutter, params, picks=None, al
     return jnp.where(measurements.valid[:, None], slot, PADDING), log_choice
 
 
-def _sampled(config, scorer, measurements, new, clutter, params, picks, alike):
+def _sample(config, scorer, measurements, new, clutter, params, picks, alike):
     """Slots [K, n] drawn one measurement after the other, and the log probability [n] of all.
 
     With `exclusive` a slot that an earlier measurement took has no share any more: drawn without
@@ -56,7 +56,7 @@ def _sampled(config, scorer, measurements, new, clutter, params, picks, alike):
 
     def draw(carry, k):
         taken, log_choice = carry
-        table = score(
+        table = log_likelihoods(
             config.sensor, scorer, tuple(v[k] for v in value), tuple(c[k] for c in cov), params
         )
         if alike is not None:
@@ -64,7 +64,7 @@ def _sampled(config, scorer, measurements, new, clutter, params, picks, alike):
         table = jnp.where(taken, -jnp.inf, table)
         top = jnp.maximum(table.max(0), jnp.maximum(new[k], clutter))
         share, other = jnp.exp(table - top), jnp.exp(new[k] - top)
-        total = added(share) + other + jnp.exp(clutter - top)
+        total = ordered_sum(share) + other + jnp.exp(clutter - top)
         mark = picks[k] * total
 
         # The slot in which the running sum passes the mark; "new" and "clutter" come after all.
@@ -92,26 +92,26 @@ def _sampled(config, scorer, measurements, new, clutter, params, picks, alike):
     return slot, log_choice
 
 
-def _known(config, scorer, measurements, clutter, params, picks=None):
+def _take_known(config, scorer, measurements, clutter, params, picks=None):
     """Identity i is slot i; an occupied slot that fits worse than clutter does is not taken, or,
     with `picks`, taken with its share of the two. Also the log probability [n] of such draws."""
     slots = len(scorer.constant)
     slot = jnp.clip(measurements.identity, 0, slots - 1)
     rows = jax.tree.map(lambda leaf: leaf[slot], scorer)
-    density = score(config.sensor, rows, *columns(measurements), params)
+    density = log_likelihoods(config.sensor, rows, *measurement_columns(measurements), params)
     there = measurements.valid & (measurements.identity < slots)
-    return _decided(slot, there, rows.constant > -jnp.inf, density, clutter, picks)
+    return _decide(slot, there, rows.constant > -jnp.inf, density, clutter, picks)
 
 
-def named(rows, occupied, density, measurements, clutter, picks=None):
+def associate_known_slots(rows, occupied, density, measurements, clutter, picks=None):
     """`associate` where measurement k can be of one slot alone: that of `rows` (`matched.Rows`),
     `occupied` [K, n] or not, under which it has the log density [K, n]."""
     density, clutter = stop_gradient((density, clutter))
-    slot, log_choice = _decided(rows.slot, rows.there, occupied, density, clutter, picks)
+    slot, log_choice = _decide(rows.slot, rows.there, occupied, density, clutter, picks)
     return jnp.where(measurements.valid[:, None], slot, PADDING), log_choice
 
 
-def _decided(slot, there, occupied, density, clutter, picks):
+def _decide(slot, there, occupied, density, clutter, picks):
     """What `_known` says, of slots [K] that are `there` [K] and of densities [K, n]."""
     log_choice = jnp.zeros_like(density[0])
     if picks is None:
@@ -123,7 +123,7 @@ def _decided(slot, there, occupied, density, clutter, picks):
         taken = picks < jax.nn.sigmoid(density - clutter)
         chosen = jax.nn.log_sigmoid(jnp.where(taken, density - clutter, clutter - density))
         drawn = occupied & there[:, None] & (clutter > -jnp.inf)
-        log_choice = added(jnp.where(drawn, chosen, 0.0))
+        log_choice = ordered_sum(jnp.where(drawn, chosen, 0.0))
     slot = jnp.where(occupied, jnp.where(taken, slot[:, None], CLUTTER), NEW)
     return jnp.where(there[:, None], slot, NEW), log_choice
 
@@ -136,7 +136,7 @@ def _maximum_likelihood(config, scorer, measurements, threshold, params, alike):
         jnp.full((len(threshold), lanes), -1, jnp.int32),
     )
     possible = _possible(config, scorer, measurements, threshold, alike)
-    pairs, count = listed(possible.reshape(-1))
+    pairs, count = nonzero_indices(possible.reshape(-1))
 
     # A running "is it greater" is plain vector code on a CPU; argmax is not (ten times slower).
     def look(i, best):
@@ -150,14 +150,16 @@ def _maximum_likelihood(config, scorer, measurements, threshold, params, alike):
     best = jax.lax.fori_loop(0, count, look, start)
     if not config.exclusive:
         return best[1]
-    return _settle(config, scorer, measurements, threshold, params, alike, best, possible)
+    return _assign_exclusively(
+        config, scorer, measurements, threshold, params, alike, best, possible
+    )
 
 
 def _density(config, scorer, measurements, params, alike, k, m):
     """Log densities [n] of measurement k under slot m."""
     row = jax.tree.map(lambda leaf: leaf[m], scorer)
     value, cov = tuple(measurements.value[k]), tuple(measurements.cov[k])
-    density = score(config.sensor, row, value, cov, params)
+    density = log_likelihoods(config.sensor, row, value, cov, params)
     return density if alike is None else density + alike[k, m]
 
 
@@ -196,7 +198,7 @@ def _possible(config, scorer, measurements, threshold, alike=None):
     return ~(upper - jnp.maximum(away, 0) <= threshold[:, None])
 
 
-def _settle(config, scorer, measurements, threshold, params, alike, best, possible):
+def _assign_exclusively(config, scorer, measurements, threshold, params, alike, best, possible):
     """Resolve measurements that chose the same slot: the loser goes on to its next best slot.
 
     Deferred acceptance (Gale and Shapley 1962). Both sides rank a pair by the same density, so the
@@ -207,7 +209,7 @@ def _settle(config, scorer, measurements, threshold, params, alike, best, possib
     total, slots = possible.shape
     index = jnp.arange(total)[:, None]
     share = (possible[:, None] & possible).any(-1) & (index < jnp.arange(total))
-    rivals, pairs = listed(share.reshape(-1), total * (total - 1) // 2)
+    rivals, pairs = nonzero_indices(share.reshape(-1), total * (total - 1) // 2)
 
     def losers(best):
         density, slot = best
@@ -227,7 +229,7 @@ def _settle(config, scorer, measurements, threshold, params, alike, best, possib
         here = index == loser
         held = jnp.where(here, density, 0).sum(0), jnp.where(here, slot, 0).sum(0)
         moved = here.any(1)
-        tried, count = listed((possible & moved[:, None]).reshape(-1))
+        tried, count = nonzero_indices((possible & moved[:, None]).reshape(-1))
 
         def look(i, found):
             k, m = jnp.divmod(tried[i], slots)
@@ -246,7 +248,7 @@ def _settle(config, scorer, measurements, threshold, params, alike, best, possib
     return settled[0][1]
 
 
-def columns(measurements):
+def measurement_columns(measurements):
     """Value and covariance as tuples of [K, 1] columns, to broadcast over particles."""
     value = tuple(measurements.value[:, i, None] for i in range(2))
     cov = tuple(measurements.cov[:, i, None] for i in range(3))

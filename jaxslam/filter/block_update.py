@@ -16,15 +16,15 @@ from jaxslam.filter import (
     landmarks,
     proposal,
 )
-from jaxslam.filter.appearance import Looks
+from jaxslam.filter.appearance import Appearances
 from jaxslam.filter.association import CLUTTER, NEW
 from jaxslam.filter.landmarks import Landmarks
 from jaxslam.filter.lazy_resampling import Ancestry
-from jaxslam.filter.xla import added, once
+from jaxslam.filter.xla import compute_once, ordered_sum
 from jaxslam.models import motion, sensors
 
 
-class Chance(NamedTuple):
+class RandomNumbers(NamedTuple):
     """Random numbers of one step: standard normals [3, N] behind the poses, the uniform behind
     resampling, and uniforms [K, N] behind associations (None: these are not drawn)."""
 
@@ -35,7 +35,7 @@ class Chance(NamedTuple):
 
 class Observed(NamedTuple):
     """Particles after a frame: `pose` [3, N] and map; `density` [N], log of motion x measurements
-    over what pose and associations were drawn from; `match` and `birth` [K, N] (`filter.Info`);
+    over what pose and associations were drawn from; `match` and `landmark_id` [K, N] (`filter.Info`);
     `log_choice` [N], log probability of the draw; `counts` [2, N]: landmarks lost for want of a
     slot, and forgotten; `u` [3, N]: the normals that `motion.sample` made the poses of; and what
     belongs to the map (None of a block of particles alone); slots `free` [K] for what was new."""
@@ -44,13 +44,13 @@ class Observed(NamedTuple):
     landmarks: Landmarks
     density: jax.Array
     match: jax.Array
-    birth: jax.Array
+    landmark_id: jax.Array
     log_choice: jax.Array
     counts: jax.Array
     u: jax.Array
-    bounds: candidate_slots.Bounds | None = None
+    bounds: candidate_slots.SlotBounds | None = None
     ancestry: Ancestry | None = None
-    looks: Looks | None = None
+    looks: Appearances | None = None
     free: jax.Array | None = None
 
 
@@ -74,16 +74,16 @@ def update_block(particles, before, rows, odometry, measurements, alike, params,
     """
     pose, predicted, sensor_pose, normals, picks = particles
     sensor, informed = config.sensor, config.proposal == "informed"
-    noise = sensors.correlated(params, odometry)
+    noise = sensors.correlated_noise(params, odometry)
     anchor = tuple(before.anchor) if before.anchor is not None else None
     seen = sensors.observe(sensor, tuple(sensor_pose), tuple(before.mean), anchor, params)
     axes, by_u = None, None
     if informed:
-        axes = proposal.axes(pose, predicted, sensor_pose, odometry, params)
-        by_u = proposal.rows(sensor, sensor_pose, axes, before.mean, anchor, seen.value)
+        axes = proposal.motion_axes(pose, predicted, sensor_pose, odometry, params)
+        by_u = proposal.pose_jacobian(sensor, sensor_pose, axes, before.mean, anchor, seen.value)
     count = (landmarks.in_view(seen, params) & (before.count > 0)).sum(0) if config.even else 1
     inlier = jnp.log1p(-params.outlier) - jnp.log(jnp.maximum(count, 1))
-    scorer = landmarks.scorer(sensor, seen, before, inlier, by_u)
+    scorer = landmarks.make_scorer(sensor, seen, before, inlier, by_u)
     new = sensors.log_new_density(sensor, tuple(measurements.value.T), params)
     clutter = sensors.log_clutter_density(sensor, params)
     if rows is None:
@@ -91,9 +91,9 @@ def update_block(particles, before, rows, odometry, measurements, alike, params,
             config, scorer, measurements, new, clutter, params, picks, alike
         )
     else:
-        fit = _fit(sensor, sensor_pose, before, rows, measurements, noise)
-        own = _densities(sensor, sensor_pose, before, inlier, by_u, measurements, params, fit)
-        match, log_choice = association.named(
+        fit = _fit_known(sensor, sensor_pose, before, rows, measurements, noise)
+        own = _score_known(sensor, sensor_pose, before, inlier, by_u, measurements, params, fit)
+        match, log_choice = association.associate_known_slots(
             rows, before.count > 0, own, measurements, clutter, picks
         )
     log_ratio, u = 0.0, normals
@@ -104,36 +104,36 @@ def update_block(particles, before, rows, odometry, measurements, alike, params,
         whitened = proposal.inform(sensor, sensor_pose, axes, before, row, measurements, noise)
         u, log_ratio = hold(proposal.draw(whitened, normals))
         predicted = hold(jnp.stack(motion.sample(pose, odometry, params, u)))
-        sensor_pose = jnp.stack(sensors.pose_of(tuple(predicted), params))
+        sensor_pose = jnp.stack(sensors.sensor_pose_of(tuple(predicted), params))
     if rows is None:
         again = config.association == "known" or not config.exclusive
-        world, density = landmark_updates.updated(
+        world, density = landmark_updates.update_matched(
             sensor, tuple(sensor_pose), before, match, measurements, noise, again
         )
     else:
         if informed:
-            fit = _fit(sensor, sensor_pose, before, rows, measurements, noise)
-        world, density = landmark_updates.updated_rows(
+            fit = _fit_known(sensor, sensor_pose, before, rows, measurements, noise)
+        world, density = landmark_updates.update_known(
             sensor, tuple(sensor_pose), before, rows, match, measurements, noise, fit
         )
-    density = _with_unmatched(config, density, match, new, clutter, count)
+    density = _add_unmatched(config, density, match, new, clutter, count)
     if alike is not None:
         own = jnp.take_along_axis(alike, jnp.maximum(match, 0), 1)
-        density = density + added(jnp.where(match >= 0, own, 0.0))
+        density = density + ordered_sum(jnp.where(match >= 0, own, 0.0))
     forgotten = jnp.zeros_like(match[0])
     if config.forgetting:
-        world, forgotten = landmarks.existence(world, seen, params)
+        world, forgotten = landmarks.update_existence(world, seen, params)
     counts = jnp.stack([jnp.zeros_like(forgotten), forgotten]).astype(jnp.int32)
     density = density + log_ratio - log_choice
-    birth = world.birth
+    landmark_id = world.landmark_id
     if rows is None:
-        world = landmarks.settle(world)
-        birth = jnp.take_along_axis(birth, jnp.maximum(match, 0), 0)
-    birth = jnp.where(match >= 0, birth, match)
-    return Observed(predicted, world, density, match, birth, log_choice, counts, u)
+        world = landmarks.unmark_matched(world)
+        landmark_id = jnp.take_along_axis(landmark_id, jnp.maximum(match, 0), 0)
+    landmark_id = jnp.where(match >= 0, landmark_id, match)
+    return Observed(predicted, world, density, match, landmark_id, log_choice, counts, u)
 
 
-def _densities(sensor, sensor_pose, before, inlier, by_u, measurements, params, fit):
+def _score_known(sensor, sensor_pose, before, inlier, by_u, measurements, params, fit):
     """Log densities [K, n] of measurements under the landmarks of their rows, to associate by.
 
     With the pose exact and errors independent from frame to frame the update has them already.
@@ -142,31 +142,33 @@ def _densities(sensor, sensor_pose, before, inlier, by_u, measurements, params, 
     def scored():
         anchor = tuple(before.anchor) if before.anchor is not None else None
         seen = sensors.observe(sensor, tuple(sensor_pose), tuple(before.mean), anchor, params)
-        scorer = landmarks.scorer(sensor, seen, before, inlier, by_u)
-        return landmarks.score(sensor, scorer, *association.columns(measurements), params)
+        scorer = landmarks.make_scorer(sensor, seen, before, inlier, by_u)
+        return landmarks.log_likelihoods(
+            sensor, scorer, *association.measurement_columns(measurements), params
+        )
 
     if sensor == "bearing" or by_u is not None:
         return scored()
     return jax.lax.cond(params.correlation > 0, scored, lambda: inlier + fit[2])
 
 
-def _fit(sensor, sensor_pose, before, rows, measurements, params):
+def _fit_known(sensor, sensor_pose, before, rows, measurements, params):
     """`matched.fitted`, as arrays."""
     given = sensor, tuple(sensor_pose), before, measurements, params
-    return once(rows.earlier[0] >= 0, lambda: landmark_updates.fitted(*given))
+    return compute_once(rows.earlier[0] >= 0, lambda: landmark_updates.fit_known(*given))
 
 
-def _with_unmatched(config, density, match, new, clutter, count):
+def _add_unmatched(config, density, match, new, clutter, count):
     """Log densities [n] of a frame's matches, with what is new or clutter, and `even`'s orders."""
-    density = density + added(jnp.where(match == NEW, new[:, None], 0.0))
+    density = density + ordered_sum(jnp.where(match == NEW, new[:, None], 0.0))
     if config.clutter:
-        density = density + added(jnp.where(match == CLUTTER, clutter, 0.0))
+        density = density + ordered_sum(jnp.where(match == CLUTTER, clutter, 0.0))
     if config.even:
-        density = density - _orders(count, (match >= 0).sum(0))
+        density = density - _log_orders(count, (match >= 0).sum(0))
     return density
 
 
-def _orders(count, matched):
+def _log_orders(count, matched):
     """Log of in how many ways as many landmarks as `matched` [n] are picked from `count` [n]."""
     count = jnp.maximum(count, matched) + 1.0
     return gammaln(count) - gammaln(count - matched)

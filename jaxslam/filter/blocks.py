@@ -15,7 +15,7 @@ from jaxslam.filter import (
     proposal,
 )
 from jaxslam.filter.block_update import Observed, move_block, update_block
-from jaxslam.filter.xla import corner, listed, once, pinned, rounds
+from jaxslam.filter.xla import barrier, compute_once, nonzero_indices, repeat, row_start
 from jaxslam.models import geometry, motion, sensors
 
 
@@ -42,7 +42,7 @@ def gather_block(world, slots, rows, start, width):
 
     def one(i, parts):
         def take(leaf, part):
-            at = corner(leaf, slots[which[i]], start)
+            at = row_start(leaf, slots[which[i]], start)
             row = jax.lax.dynamic_slice(leaf, at, (*leaf.shape[:-2], 1, width))
             return jax.lax.dynamic_update_slice_in_dim(part, row, which[i], leaf.ndim - 2)
 
@@ -52,7 +52,7 @@ def gather_block(world, slots, rows, start, width):
         lambda leaf: jnp.zeros((*leaf.shape[:-2], len(slots), width), leaf.dtype),
         world,
     )
-    return rounds(count, one, empty)
+    return repeat(count, one, empty)
 
 
 def scatter_block(world, part, slots, rows, start):
@@ -69,12 +69,12 @@ def scatter_block(world, part, slots, rows, start):
     def one(i, leaves):
         def put(leaf, new):
             row = jax.lax.dynamic_slice_in_dim(new, which[i], 1, new.ndim - 2)
-            at = corner(leaf, slots[which[i]], start)
+            at = row_start(leaf, slots[which[i]], start)
             return jax.lax.dynamic_update_slice(leaf, row, at)
 
         return jax.tree.map(put, leaves, part)
 
-    return rounds(count, one, world)
+    return repeat(count, one, world)
 
 
 SWEEP = 16  # steps
@@ -91,25 +91,29 @@ def observe(state, chance, odometry, measurements, params, config, frozen=False)
     """
     hold = jax.lax.stop_gradient if frozen else lambda value: value
     pose, n = state.pose, state.pose.shape[1]
-    measurements = sensors.rescaled(measurements, params)
+    measurements = sensors.apply_position_scale(measurements, params)
     params = params._replace(sigma_bearing=geometry.norm(params.sigma_bearing, params.caution))
     if config.sensor == "bearing" and config.association == "maximum_likelihood":
-        params = sensors.at_most_one_new(params)
+        params = sensors.cap_new_density(params)
     if not config.clutter:
         params = params._replace(outlier=jnp.zeros(()))
     # Outside the loop: XLA would work out cosine and sine again for every landmark.
     sure = state.step >= 0
-    chance = chance._replace(normals=once(sure, lambda: chance.normals))
+    chance = chance._replace(normals=compute_once(sure, lambda: chance.normals))
     u = jnp.zeros_like(pose) if config.proposal == "informed" else chance.normals
     # Pinned: worked out again where it is used, it would be rounded otherwise.
-    predicted = once(sure, lambda: motion.sample(pose, odometry, params, u))
-    predicted = pinned(hold(jnp.stack(predicted)))
-    sensor_pose = once(sure, lambda: sensors.pose_of(tuple(predicted), params))
-    sensor_pose = pinned(jnp.stack(sensor_pose))
-    alike = None if state.looks is None else appearance.gain(state.looks, measurements)
-    rows = _concerned(state, predicted, sensor_pose, odometry, measurements, alike, params, config)
+    predicted = compute_once(sure, lambda: motion.sample(pose, odometry, params, u))
+    predicted = barrier(hold(jnp.stack(predicted)))
+    sensor_pose = compute_once(sure, lambda: sensors.sensor_pose_of(tuple(predicted), params))
+    sensor_pose = barrier(jnp.stack(sensor_pose))
+    alike = (
+        None if state.looks is None else appearance.log_likelihood_ratio(state.looks, measurements)
+    )
+    rows = _select_candidates(
+        state, predicted, sensor_pose, odometry, measurements, alike, params, config
+    )
     rows &= measurements.active
-    world, past, rows = _caught_up(state, rows, config)
+    world, past, rows = _apply_ancestry(state, rows, config)
     free = jnp.nonzero(~state.bounds.used, size=config.measurements, fill_value=config.landmarks)[0]
     particles = pose, predicted, sensor_pose, chance.normals, chance.picks
     frame = odometry, measurements, alike, params, free, state.step
@@ -117,37 +121,39 @@ def observe(state, chance, odometry, measurements, params, config, frozen=False)
     zero = jnp.zeros(n, pose.dtype)
     counts = jnp.zeros((2, n), jnp.int32)
     seen = Observed(predicted, world, zero, match, match, zero, counts, chance.normals)
-    seen = seen, jax.lax.stop_gradient(candidate_slots.nowhere(config, pose.dtype))
-    for size, chosen in _sizes(config, rows.sum()):
+    seen = seen, jax.lax.stop_gradient(candidate_slots.empty_bounds(config, pose.dtype))
+    for size, chosen in _candidate_sizes(config, rows.sum()):
         seen = _blocks(seen, particles, rows, frame, config, hold, size, chosen)
     seen, found = seen
-    found = candidate_slots.joined(found, config)
+    found = candidate_slots.merge_devices(found, config)
     if past is not None:  # what was free has nothing to catch up with
         past = past._replace(
             chain=jnp.where(found.used & ~state.bounds.used, lazy_resampling.CURRENT, past.chain)
         )
     looked = state.looks
     if looked is not None:
-        looked = appearance.without(looked, found.used & ~state.bounds.used)
+        looked = appearance.clear_slots(looked, found.used & ~state.bounds.used)
     touched = rows | found.used
-    if landmark_updates.by_name(config):  # no bounds are asked for
-        bounds = candidate_slots.unlimited(state.bounds, found.used | (rows & state.bounds.used))
+    if landmark_updates.uses_known_slots(config):  # no bounds are asked for
+        bounds = candidate_slots.lift(state.bounds, found.used | (rows & state.bounds.used))
     else:
         bounds = jax.tree.map(lambda new, old: jnp.where(touched, new, old), found, state.bounds)
     return seen._replace(bounds=bounds, ancestry=past, looks=looked, free=free)
 
 
-def _concerned(state, predicted, sensor_pose, odometry, measurements, alike, params, config):
+def _select_candidates(
+    state, predicted, sensor_pose, odometry, measurements, alike, params, config
+):
     """Slots [M] to look at."""
     extra = 0.0
     if config.proposal == "informed":
-        axes = proposal.axes(state.pose, predicted, sensor_pose, odometry, params)
+        axes = proposal.motion_axes(state.pose, predicted, sensor_pose, odometry, params)
         extra = jnp.max(sum(x * x + y * y for x, y, _ in axes))
     given = state.bounds, sensor_pose, measurements, alike, params, extra
-    return candidate_slots.concerned(config, *jax.lax.stop_gradient(given))
+    return candidate_slots.select_candidates(config, *jax.lax.stop_gradient(given))
 
 
-def _caught_up(state, rows, config):
+def _apply_ancestry(state, rows, config):
     """The map with these slots [M] where their particles are, and its ancestry.
 
     Particles that used a slot out of sight may have no descendants left: when slots run short, now
@@ -159,17 +165,17 @@ def _caught_up(state, rows, config):
         looked = rows | (state.bounds.used & short & (state.step % SWEEP == 0))
     world, past = state.landmarks, state.ancestry
     if past is not None:
-        world, past = lazy_resampling.update(
-            world, past, looked | lazy_resampling.last_of(past), config
+        world, past = lazy_resampling.apply_ancestry(
+            world, past, looked | lazy_resampling.oldest_slots(past), config
         )
     return world, past, looked
 
 
-def _sizes(config, count):
+def _candidate_sizes(config, count):
     """Numbers of slots that a block may look at, and which to go with: the smallest that `count`
     fits in."""
     total, size, sizes = config.landmarks, SMALLEST, []
-    if landmark_updates.by_name(config):
+    if landmark_updates.uses_known_slots(config):
         yield config.measurements, True
         return
     while size < total:
@@ -181,7 +187,7 @@ def _sizes(config, count):
         least = size
 
 
-def _widths(n, most):
+def _block_widths(n, most):
     """(start, width, number) of blocks that make up n particles, alike but for one particle.
 
     A narrow rest would be compiled to other arithmetic, and be rounded otherwise.
@@ -201,9 +207,13 @@ def _blocks(whole, particles, rows, frame, config, hold, size, chosen):
     slots = jnp.arange(total, dtype=jnp.int32)
     own, taken = None, None if size == total else (slots[:size], rows.sum())
     put = taken
-    if landmark_updates.by_name(config):
-        own = landmark_updates.rows_of(measurements, total)
-        slots, taken, put = own.slot, listed(own.there), listed(own.there & (own.earlier == 0))
+    if landmark_updates.uses_known_slots(config):
+        own = landmark_updates.known_slots(measurements, total)
+        slots, taken, put = (
+            own.slot,
+            nonzero_indices(own.there),
+            nonzero_indices(own.there & (own.earlier == 0)),
+        )
     elif size < total:
         slots = jnp.nonzero(rows, size=size, fill_value=total)[0].astype(jnp.int32)
         measurements = local_identities(measurements, slots, total)
@@ -236,24 +246,22 @@ def _blocks(whole, particles, rows, frame, config, hold, size, chosen):
             carry._replace(landmarks=None),
             done._replace(landmarks=None),
         )
-        fixed = dict(anchor=None, birth=None)  # what a look leaves as it is
+        fixed = dict(anchor=None, landmark_id=None)  # what a look leaves as it is
         world = scatter_block(
             carry.landmarks._replace(**fixed), done.landmarks._replace(**fixed), slots, put, start,
-        )._replace(anchor=carry.landmarks.anchor, birth=carry.landmarks.birth)  # fmt: skip
-        at = tuple(sensors.pose_of(tuple(done.pose), params))
+        )._replace(anchor=carry.landmarks.anchor, landmark_id=carry.landmarks.landmark_id)  # fmt: skip
+        at = tuple(sensors.sensor_pose_of(tuple(done.pose), params))
         if own is None:
-            bounds = candidate_slots.widened(bounds, jax.lax.stop_gradient(done.landmarks), slots)
+            bounds = candidate_slots.widen(bounds, jax.lax.stop_gradient(done.landmarks), slots)
         world, born, lost = new_landmarks.create(
             config, world, start, at, done.match, free, named, params, number
         )
         counts = jax.lax.dynamic_update_slice_in_dim(rest.counts, lost[None], start, -1)
-        return rest._replace(landmarks=world, counts=counts), candidate_slots.unlimited(
-            bounds, born
-        )
+        return rest._replace(landmarks=world, counts=counts), candidate_slots.lift(bounds, born)
 
-    for first, width, blocks in _widths(particles[0].shape[1], config.block):
+    for first, width, blocks in _block_widths(particles[0].shape[1], config.block):
         # A number that XLA does not know: it would open up a loop of one round, and fuse and round
         # otherwise than in a loop of many.
-        count = pinned(jnp.where(chosen, blocks, 0))
-        whole = rounds(count, partial(block, first=first, width=width), whole)
+        count = barrier(jnp.where(chosen, blocks, 0))
+        whole = repeat(count, partial(block, first=first, width=width), whole)
     return whole

@@ -16,7 +16,7 @@ from jaxslam.models import geometry, sensors
 FEW = 32  # slots are all looked at
 
 
-class Bounds(NamedTuple):
+class SlotBounds(NamedTuple):
     """Of every slot: the box `low`, `high` [2, M] of its means, the largest trace `spread` [M] of
     their covariances, and whether any particle has `used` [M] it. Never too narrow."""
 
@@ -26,11 +26,11 @@ class Bounds(NamedTuple):
     used: jax.Array
 
 
-def of_rows(world):
+def bounds_of(world):
     """`Bounds` of these landmarks [.., M, N]."""
     there = world.count > 0
     l11, l21, l22 = world.factor
-    return Bounds(
+    return SlotBounds(
         jnp.where(there, world.mean, jnp.inf).min(-1),
         jnp.where(there, world.mean, -jnp.inf).max(-1),
         jnp.where(there, l11 * l11 + l21 * l21 + l22 * l22, 0.0).max(-1),
@@ -38,17 +38,17 @@ def of_rows(world):
     )
 
 
-def nowhere(config, dtype):
+def empty_bounds(config, dtype):
     """`Bounds` of no landmarks at all."""
     low = jnp.full((2, config.landmarks), jnp.inf, dtype)
-    return Bounds(low, -low, jnp.zeros_like(low[0]), jnp.zeros(low.shape[1], bool))
+    return SlotBounds(low, -low, jnp.zeros_like(low[0]), jnp.zeros(low.shape[1], bool))
 
 
-def widened(bounds, world, slots):
+def widen(bounds, world, slots):
     """The bounds, wide enough for more landmarks [.., S, n] in these slots [S]."""
-    low, high, spread, used = of_rows(world)
+    low, high, spread, used = bounds_of(world)
     at = bounds.low.at[:, slots], bounds.high.at[:, slots]
-    return Bounds(
+    return SlotBounds(
         at[0].min(low, mode="drop"),
         at[1].max(high, mode="drop"),
         bounds.spread.at[slots].max(spread, mode="drop"),
@@ -56,21 +56,21 @@ def widened(bounds, world, slots):
     )
 
 
-def joined(bounds, config):
+def merge_devices(bounds, config):
     """The bounds that hold on every device, from its own."""
     used = jnp.where(bounds.used, -1.0, 0.0).astype(bounds.spread.dtype)
     low, high, spread, used = jnp.split(
-        sharding.least(
+        sharding.all_min(
             jnp.concatenate([bounds.low, -bounds.high, -bounds.spread[None], used[None]]), config
         ),
         [2, 4, 5],
     )
-    return Bounds(low, -high, -spread[0], used[0] < 0)
+    return SlotBounds(low, -high, -spread[0], used[0] < 0)
 
 
-def unlimited(bounds, born):
+def lift(bounds, born):
     """The bounds without any for slots [M] in which landmarks were `born`, until next looked at."""
-    return Bounds(
+    return SlotBounds(
         jnp.where(born, -jnp.inf, bounds.low),
         jnp.where(born, jnp.inf, bounds.high),
         jnp.where(born, jnp.inf, bounds.spread),
@@ -78,7 +78,7 @@ def unlimited(bounds, born):
     )
 
 
-def concerned(config, bounds, sensor_pose, measurements, alike, params, extra):
+def select_candidates(config, bounds, sensor_pose, measurements, alike, params, extra):
     """Slots [M] that some particle's look may concern.
 
     `known`: those named, and if landmarks are forgotten all that may be in view. Bearings alone
@@ -104,7 +104,7 @@ def concerned(config, bounds, sensor_pose, measurements, alike, params, extra):
         return used
     x, y = sensor_pose[0], sensor_pose[1]
     ends = jnp.stack([x.min(), y.min(), -x.max(), -y.max(), -jnp.asarray(extra, x.dtype)])
-    ends = sharding.least(ends, config)
+    ends = sharding.all_min(ends, config)
     here_low, here_high, extra = ends[:2], -ends[2:4], -ends[4]
     gap = jnp.maximum(bounds.low - here_high[:, None], here_low[:, None] - bounds.high)
     nearest = jnp.hypot(*jnp.maximum(gap, 0.0)) * 0.9999

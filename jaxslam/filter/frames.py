@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.config import default_params
-from jaxslam.logs.appearance_space import space
+from jaxslam.logs.appearance_space import fit_appearance_space
 from jaxslam.logs.odometry import Odometry, increments
 from jaxslam.models.sensors import Measurements
 
@@ -23,7 +23,7 @@ class Frames(NamedTuple):
     dropped: dict[str, int]
 
 
-def frames(log, sensor, measurements=None, params=None, known=False, descriptors=0):
+def frames_from_log(log, sensor, measurements=None, params=None, known=False, descriptors=0):
     """`Frames` of a log for one sensor.
 
     `measurements`: slots per frame (None: as many as the fullest frame needs); beyond them the
@@ -43,7 +43,7 @@ def frames(log, sensor, measurements=None, params=None, known=False, descriptors
     dropped = {}
     identity, identities = np.full(len(log.frame), -1), np.empty(0, np.int64)
     if known:
-        rows = _identified(log, rows, dropped)
+        rows = _with_identity(log, rows, dropped)
         identities, identity[rows] = np.unique(log.identity[rows], return_inverse=True)
     rows, slot, slots = _slots(log, rows, reach, measurements, dropped)
     row = np.full((len(log.frame_time), slots), -1)
@@ -59,7 +59,7 @@ def frames(log, sensor, measurements=None, params=None, known=False, descriptors
             identity=np.append(identity, -1)[row].astype(np.int32),
             valid=row >= 0,
             active=np.ones(len(row), bool),
-            **_looks(log, descriptors, row),
+            **_appearance_columns(log, descriptors, row),
         ),
         identities=identities,
         row=row,
@@ -85,11 +85,11 @@ def _values(log, sensor, params):
     return np.column_stack([r * c, r * s]), cov, r
 
 
-def _looks(log, size, row):
+def _appearance_columns(log, size, row):
     """`Measurements.descriptor` [T, K, J] and `within` [T, J] of the slots' rows."""
     if not size:
         return {}
-    found = space(log)
+    found = fit_appearance_space(log)
     if len(found.within) < size:
         raise ValueError(
             f"{log.name}: {size} descriptors are asked for, but {len(found.within)} tell landmarks "
@@ -106,7 +106,7 @@ def _scale(log, sensor, row):
     return np.append(np.isfinite(log.point_baseline), False)[row].astype(float)
 
 
-def _identified(log, rows, dropped):
+def _with_identity(log, rows, dropped):
     """Those of the rows that carry an identity, the first of each identity in a frame."""
     if log.identity is None or (len(log.identity) and (log.identity < 0).all()):
         raise ValueError(f"{log.name}: association 'known' needs identities; this log has none")

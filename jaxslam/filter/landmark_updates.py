@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.filter.landmarks import update
-from jaxslam.filter.xla import added, listed, rounds
+from jaxslam.filter.xla import nonzero_indices, ordered_sum, repeat
 
 
-class Rows(NamedTuple):
+class KnownSlots(NamedTuple):
     """Where identities are known, and nothing else is looked at: a block's landmarks, one of every
     measurement. The `slot` [K] of each, if it is `there` [K]; the measurement that was the `first`
     [K] to name it; and how many `earlier` [K] ones did."""
@@ -20,22 +20,22 @@ class Rows(NamedTuple):
     earlier: jax.Array
 
 
-def by_name(config):
+def uses_known_slots(config):
     """Whether a look concerns the slots of the measured identities alone (`Rows`)."""
     return config.association == "known" and not config.forgetting
 
 
-def rows_of(measurements, slots):
+def known_slots(measurements, slots):
     """`Rows` of a frame, in a map of so many slots."""
     slot = measurements.identity
     there = measurements.valid & (slot >= 0) & (slot < slots)
     same = (slot[:, None] == slot) & there[:, None] & there
     earlier = jnp.tril(same, -1).sum(1, dtype=jnp.int32)
     slot = jnp.where(there, slot, slots).astype(jnp.int32)
-    return Rows(slot, there, jnp.argmax(same, 1).astype(jnp.int32), earlier)
+    return KnownSlots(slot, there, jnp.argmax(same, 1).astype(jnp.int32), earlier)
 
 
-def fitted(sensor, sensor_pose, world, measurements, params):
+def fit_known(sensor, sensor_pose, world, measurements, params):
     """Every row's landmark [K, n] updated by its measurement: mean, factor, log density."""
     value, cov = (tuple(part.T[:, :, None]) for part in map(jnp.asarray, measurements[:2]))
     anchor = None if world.anchor is None else tuple(world.anchor)
@@ -44,7 +44,7 @@ def fitted(sensor, sensor_pose, world, measurements, params):
     )
 
 
-def updated_rows(sensor, sensor_pose, world, rows, match, measurements, params, fit):
+def update_known(sensor, sensor_pose, world, rows, match, measurements, params, fit):
     """`updated` of a block whose landmarks are `Rows`, `fit` as `fitted` says; counts are not
     marked.
 
@@ -63,14 +63,14 @@ def updated_rows(sensor, sensor_pose, world, rows, match, measurements, params, 
             factor=put(world.factor, factor),
             count=world.count + matched,
         )
-        return after, added(jnp.where(matched, inlier + log_density, 0.0))
+        return after, ordered_sum(jnp.where(matched, inlier + log_density, 0.0))
 
     def again(carry):
         i, world, density = carry
         here = (rows.first == jnp.arange(len(match))[:, None]) & (rows.earlier == i) & rows.there
         k = jnp.argmax(here, 1)
         given = jax.tree.map(lambda leaf: leaf[k] if leaf.ndim else leaf, measurements)
-        fit = fitted(sensor, sensor_pose, world, given, params)
+        fit = fit_known(sensor, sensor_pose, world, given, params)
         world, more = some(world, fit, here.any(1)[:, None] & (match[k] >= 0))
         return i + 1, world, density + more
 
@@ -79,7 +79,7 @@ def updated_rows(sensor, sensor_pose, world, rows, match, measurements, params, 
     return jax.lax.while_loop(lambda carry: carry[0] <= most, again, (1, *first))[1:]
 
 
-def updated(sensor, sensor_pose, world, match, measurements, params, again):
+def update_matched(sensor, sensor_pose, world, match, measurements, params, again):
     """The map after the frame's matched measurements, in their order, and log densities [n].
 
     Only the matched slots are read and written, all at once; `again`: the measurements of a frame
@@ -89,7 +89,7 @@ def updated(sensor, sensor_pose, world, match, measurements, params, again):
     """
     inlier = jnp.log1p(-params.outlier)
     value, cov = (tuple(part.T[:, :, None]) for part in map(jnp.asarray, measurements[:2]))
-    times = _times(match) if again else jnp.zeros_like(match)
+    times = _earlier_matches(match) if again else jnp.zeros_like(match)
 
     def some(carry):
         i, world, density = carry
@@ -101,7 +101,7 @@ def updated(sensor, sensor_pose, world, match, measurements, params, again):
         )
         new = jnp.stack(mean), jnp.stack(factor), -1 - jnp.abs(old.count)
         world = _write(world, slot, new)
-        return i + 1, world, density + added(jnp.where(slot >= 0, inlier + log_density, 0.0))
+        return i + 1, world, density + ordered_sum(jnp.where(slot >= 0, inlier + log_density, 0.0))
 
     start = 0, world, jnp.zeros_like(sensor_pose[0])
     if not again:
@@ -109,7 +109,7 @@ def updated(sensor, sensor_pose, world, match, measurements, params, again):
     return jax.lax.while_loop(lambda carry: carry[0] <= times.max(), some, start)[1:]
 
 
-def _times(match):
+def _earlier_matches(match):
     """How often the slot of a match [K, n] was matched before in the frame."""
 
     def one(k, times):
@@ -124,12 +124,12 @@ def _shared(slot):
     the same of those that have."""
     top = slot.max(1)
     alike = ((slot == top[:, None]) | (slot < 0)).all(1)
-    return top, listed(alike & (top >= 0)), listed(~alike)
+    return top, nonzero_indices(alike & (top >= 0)), nonzero_indices(~alike)
 
 
 def _read(world, slot):
     """The landmarks [.., K, n] in the slots [K, n] of each particle; -1: any."""
-    parts = world._replace(log_odds=None, birth=None)
+    parts = world._replace(log_odds=None, landmark_id=None)
     lane = jnp.arange(slot.shape[1])
     top, (rows, count), (others, rest) = _shared(slot)
 
@@ -150,8 +150,8 @@ def _read(world, slot):
         return put(found, k, jax.tree.map(lambda leaf: leaf[..., at, lane], parts))
 
     found = jax.tree.map(lambda leaf: jnp.ones((*leaf.shape[:-2], *slot.shape), leaf.dtype), parts)
-    found = rounds(count, one, found)
-    return rounds(rest, other, found)
+    found = repeat(count, one, found)
+    return repeat(rest, other, found)
 
 
 def _write(world, slot, new):
@@ -184,6 +184,6 @@ def _write(world, slot, new):
             new,
         )
 
-    leaves = rounds(count, one, (world.mean, world.factor, world.count))
-    mean, factor, count = rounds(rest, other, leaves)
+    leaves = repeat(count, one, (world.mean, world.factor, world.count))
+    mean, factor, count = repeat(rest, other, leaves)
     return world._replace(mean=mean, factor=factor, count=count)

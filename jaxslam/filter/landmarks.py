@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.filter.xla import added
+from jaxslam.filter.xla import ordered_sum
 from jaxslam.models import geometry, sensors
 from jaxslam.models.geometry import wrap
 
@@ -24,7 +24,7 @@ class Landmarks(NamedTuple):
 
     `mean` [2, M, N], `factor` [3, M, N]: lower factor (l11, l21, l22), `anchor` [2, M, N] or None
     (see `sensors`), `log_odds` [M, N] of existence or None, `count` [M, N]: times seen,
-    `birth` [M, N]: frame * K + k of the measurement that created it.
+    `landmark_id` [M, N]: frame * K + k of the measurement that created it.
     """
 
     mean: jax.Array
@@ -32,7 +32,7 @@ class Landmarks(NamedTuple):
     anchor: jax.Array | None
     log_odds: jax.Array | None
     count: jax.Array
-    birth: jax.Array
+    landmark_id: jax.Array
 
 
 class Scorer(NamedTuple):
@@ -53,11 +53,11 @@ def empty(config, dtype):
         anchor=jnp.zeros((2, *shape), dtype) if config.sensor == "bearing" else None,
         log_odds=jnp.zeros(shape, dtype) if config.forgetting else None,
         count=jnp.zeros(shape, jnp.int32),
-        birth=jnp.zeros(shape, jnp.int32),
+        landmark_id=jnp.zeros(shape, jnp.int32),
     )
 
 
-def scorer(sensor, seen, landmarks, inlier, by_u=None):
+def make_scorer(sensor, seen, landmarks, inlier, by_u=None):
     """`Scorer` of every slot; empty slots score -inf. `inlier`: log probability added to all.
 
     `by_u`: rows of the predicted measurement by the pose's own standard normals (see `proposal`),
@@ -73,7 +73,7 @@ def scorer(sensor, seen, landmarks, inlier, by_u=None):
 
     s00 = product(0, 0)
     if sensor == "bearing":
-        shift, extra = bend(own[0], geometry.transpose_times(factor, seen.stretch))
+        shift, extra = turn_factor(own[0], geometry.transpose_times(factor, seen.stretch))
         s00 = jnp.where(occupied, s00 + extra + seen.noise[0], 1.0)
         constant = jnp.where(occupied, inlier - 0.5 * (jnp.log(s00) + sensors.LOG_2PI), -jnp.inf)
         return Scorer((seen.value[0] + shift,), (-0.5 / s00,), constant)
@@ -89,7 +89,7 @@ def scorer(sensor, seen, landmarks, inlier, by_u=None):
     return Scorer(seen.value, matrix, constant)
 
 
-def score(sensor, scorer, value, cov, params):
+def log_likelihoods(sensor, scorer, value, cov, params):
     """log density of a measurement under a landmark; everything broadcasts."""
     if sensor == "bearing":
         v0 = wrap(value[0] - scorer.value[0])
@@ -123,7 +123,7 @@ def update(sensor, sensor_pose, mean, factor, anchor, value, cov, params):
     return mean, factor, -0.5 * (square + log) - sensors.LOG_2PI
 
 
-def bend(along, stretch):
+def turn_factor(along, stretch):
     """Mean and variance that the bearing's second derivatives add to its prediction.
 
     `along`, `stretch`: the rows of `sensors.Seen` times the landmark's factor, u and v; the Hessian
@@ -159,7 +159,7 @@ def _update_bearing(sensor_pose, mean, factor, anchor, value, params):
         seen = sensors.along_ray(point, (tx, ty), (ax, ay), part[1], sensor_pose[2], params)
         (row,), (noise,) = seen.rows, seen.noise
         spread = geometry.transpose_times(narrow, row)
-        shift, extra = bend(spread, geometry.transpose_times(narrow, seen.stretch))
+        shift, extra = turn_factor(spread, geometry.transpose_times(narrow, seen.stretch))
         rest = wrap(value - seen.value[0] - shift)
         part, cov, s = geometry.scalar_update(part, narrow, row, rest, noise + extra)
         return part, cov, split[1] - 0.5 * (rest * rest / s + jnp.log(s) + sensors.LOG_2PI)
@@ -168,7 +168,7 @@ def _update_bearing(sensor_pose, mean, factor, anchor, value, params):
     split = jax.tree.map(lambda v: jnp.array(v, jnp.result_type(l11)), SPLIT)
     part, cov, share = jax.lax.map(one, split)
     top = jax.lax.stop_gradient(share.max(0))
-    log_density = top + jnp.log(added(jnp.exp(share - top)))
+    log_density = top + jnp.log(ordered_sum(jnp.exp(share - top)))
     mean, factor = _merge(part, cov, jnp.exp(share - log_density))
     return (mean[0], jnp.maximum(mean[1], sensors.LEAST_INVERSE_DEPTH)), factor, log_density
 
@@ -176,13 +176,13 @@ def _update_bearing(sensor_pose, mean, factor, anchor, value, params):
 def _merge(mean, factor, weight):
     """Mean and factor of a mixture of normals, along the first axis; sums of squares throughout."""
     l11, l21, l22 = factor
-    m0, m1 = (added(weight * m) for m in mean)
+    m0, m1 = (ordered_sum(weight * m) for m in mean)
     d0, d1 = mean[0] - m0, mean[1] - m1
-    top = jnp.sqrt(added(weight * (l11 * l11 + d0 * d0)))
-    side = added(weight * (l11 * l21 + d0 * d1)) / top
+    top = jnp.sqrt(ordered_sum(weight * (l11 * l11 + d0 * d0)))
+    side = ordered_sum(weight * (l11 * l21 + d0 * d1)) / top
     slope = side / top
     off, away = l21 - slope * l11, d1 - slope * d0
-    low = jnp.sqrt(added(weight * (off * off + l22 * l22 + away * away)))
+    low = jnp.sqrt(ordered_sum(weight * (off * off + l22 * l22 + away * away)))
     return (m0, m1), (top, side, low)
 
 
@@ -202,7 +202,7 @@ def in_view(seen, params):
     return inside & (seen.range < params.view_range)
 
 
-def existence(world, seen, params):
+def update_existence(world, seen, params):
     """Log-odds after a frame: matched raises, expected and unseen lowers; below zero is freed.
 
     `world` is the map after `matched.updated`, with its marks; `seen` the prediction from before.
@@ -218,6 +218,6 @@ def existence(world, seen, params):
     return world._replace(log_odds=log_odds, count=jnp.where(freed, 0, world.count)), freed.sum(0)
 
 
-def settle(world):
+def unmark_matched(world):
     """The map with the frame's marks taken off."""
     return world._replace(count=jnp.abs(world.count))

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.filter import halo_exchange, sharding
-from jaxslam.filter.xla import listed, rounds
+from jaxslam.filter.xla import nonzero_indices, repeat
 
 CURRENT = -1
 TOGETHER = 2**18  # particles of all rows in one message
@@ -31,7 +31,7 @@ class Ancestry(NamedTuple):
     count: jax.Array
 
 
-def new(config):
+def empty_ancestry(config):
     """Nothing to catch up with."""
     size = min(config.chains, config.landmarks)
     return Ancestry(
@@ -42,7 +42,7 @@ def new(config):
     )
 
 
-def update(world, ancestry, wanted, config):
+def apply_ancestry(world, ancestry, wanted, config):
     """The map with the slots `wanted` [M] (or all: True) brought up to date.
 
     In place, row by row: a `take` of the whole map would need a second copy of it.
@@ -52,15 +52,15 @@ def update(world, ancestry, wanted, config):
     near = 0
     if halo_exchange.width(config):
         used = (ancestry.chain == jnp.arange(len(ancestry.begun))[:, None]) & behind
-        enough = halo_exchange.enough(ancestry.chains, config) | ~used.any(1)
+        enough = halo_exchange.suffices(ancestry.chains, config) | ~used.any(1)
         # One of two loops has no rounds: a `cond` would copy the map.
         near = jnp.where(enough.all(), count, 0)
-        world = _updated_near(world, ancestry, slots, near, config)
-    world = _updated(world, ancestry, slots, count - near, config)
+        world = _apply_near(world, ancestry, slots, near, config)
+    world = _apply(world, ancestry, slots, count - near, config)
     return world, ancestry._replace(chain=jnp.where(behind, CURRENT, ancestry.chain))
 
 
-def _updated(world, ancestry, slots, count, config):
+def _apply(world, ancestry, slots, count, config):
     """The map with the first `count` of the slots brought up to date."""
     # Rows travel between devices some at a time.
     some = 1 if config.devices == 1 else max(1, min(8, TOGETHER // config.particles))
@@ -70,36 +70,38 @@ def _updated(world, ancestry, slots, count, config):
         at = [slots[jnp.minimum(i * some + j, count - 1)] for j in range(some)]
         rows = [jax.tree.map(partial(_row, slot=slot), world) for slot in at]
         indices = [_index(ancestry, slot, config) for slot in at]
-        for slot, new in zip(at, sharding.taken(rows, indices, config), strict=True):
+        for slot, new in zip(at, sharding.gather(rows, indices, config), strict=True):
             world = jax.tree.map(partial(_put, slot=slot), world, new)
         return world
 
-    return rounds(-(-count // some), update_some, world)
+    return repeat(-(-count // some), update_some, world)
 
 
-def _updated_near(world, ancestry, slots, count, config):
+def _apply_near(world, ancestry, slots, count, config):
     """`_updated` where the neighbours' borders are all that a device needs of others."""
     some = max(1, min(8, TOGETHER // (2 * halo_exchange.width(config))))
 
     def update_some(i, world):
         first = i * some
         at = [slots[jnp.minimum(first + j, count - 1)] for j in range(some)]
-        border = halo_exchange.of_slots(world, at, config)
+        border = halo_exchange.exchange_halos(world, at, config)
 
         def update_one(j, world):
             slot = slots[first + j]
-            taken = partial(halo_exchange.put, slot=slot, index=_index(ancestry, slot, config))
+            taken = partial(
+                halo_exchange.gather_row, slot=slot, index=_index(ancestry, slot, config)
+            )
             side = jax.tree.map(partial(_row, slot=j), border)
             return jax.tree.map(partial(taken, config=config), world, side)
 
-        return rounds(jnp.minimum(some, count - first), update_one, world)
+        return repeat(jnp.minimum(some, count - first), update_one, world)
 
-    return rounds(-(-count // some), update_some, world)
+    return repeat(-(-count // some), update_some, world)
 
 
 def _index(ancestry, slot, config):
     """Where what a device's particles have in a slot is, among all particles."""
-    return sharding.mine(_row(ancestry.chains, ancestry.chain[slot]), config)
+    return sharding.local_shard(_row(ancestry.chains, ancestry.chain[slot]), config)
 
 
 def _row(leaf, slot):
@@ -110,7 +112,7 @@ def _put(leaf, new, slot):
     return jax.lax.dynamic_update_index_in_dim(leaf, new, slot, leaf.ndim - 2)
 
 
-def last_of(ancestry):
+def oldest_slots(ancestry):
     """Slots [M] of the oldest chain, if all chains are in use: they are due before resampling."""
     used = _used(ancestry)
     return used.all() & (ancestry.chain == jnp.argmin(ancestry.begun))
@@ -120,7 +122,7 @@ def _used(ancestry):
     return (ancestry.chain == jnp.arange(len(ancestry.begun))[:, None]).any(1)
 
 
-def resampled(ancestry, ancestors, wanted):
+def compose(ancestry, ancestors, wanted):
     """`Ancestry` of particles that continue `ancestors` [N] if resampling was `wanted`.
 
     There must be a chain that is not in use (`last_of`).
@@ -132,8 +134,8 @@ def resampled(ancestry, ancestors, wanted):
         new = _row(chains, which[i]).at[ancestors].get(mode="promise_in_bounds")
         return _put(chains, new, which[i])
 
-    which, count = listed(used)
-    chains = rounds(jnp.where(wanted, count, 0), follow, ancestry.chains)
+    which, count = nonzero_indices(used)
+    chains = repeat(jnp.where(wanted, count, 0), follow, ancestry.chains)
     chains = _put(chains, jnp.where(wanted, ancestors, _row(chains, free)), free)
     count = ancestry.count + wanted
     return Ancestry(

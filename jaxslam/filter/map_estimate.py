@@ -7,18 +7,18 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.filter import sharding
-from jaxslam.filter.xla import pinned
+from jaxslam.filter.xla import barrier
 from jaxslam.models import geometry
 
 
-class Table(NamedTuple):
-    """One map for all particles, M slots: world `mean` [2, M], `cov` [3, M], `count`, `birth`, and
+class LandmarkTable(NamedTuple):
+    """One map for all particles, M slots: world `mean` [2, M], `cov` [3, M], `count`, `landmark_id`, and
     whether the slot is `kept`: occupied, confirmed, and of known depth."""
 
     mean: jax.Array
     cov: jax.Array
     count: jax.Array
-    birth: jax.Array
+    landmark_id: jax.Array
     kept: jax.Array
 
 
@@ -28,41 +28,41 @@ def summarise(world, weight, best, params, config):
 
     The covariance is the mixture's: the mean of the particles' own, and the spread of their means.
     """
-    shared = sharding.same((best, params))
-    specs = sharding.lanes(world), sharding.lanes(weight), *shared
-    summary = sharding.divided(partial(_summarise, config=config), specs, sharding.ALL, config)
+    shared = sharding.replicated((best, params))
+    specs = sharding.particle_sharded(world), sharding.particle_sharded(weight), *shared
+    summary = sharding.shard_map(partial(_summarise, config=config), specs, sharding.ALL, config)
     return summary(world, weight, best, params)
 
 
 def _summarise(world, weight, best, params, config):
-    mine = sharding.one(world, best, config)
+    mine = sharding.select_particle(world, best, config)
     centre, _, depth_known = to_world(config.sensor, mine)
     confirmed = True if mine.log_odds is None else mine.log_odds >= params.existence_confirm
 
-    slots, lane = jnp.arange(len(mine.birth)), jnp.arange(len(weight))
+    slots, lane = jnp.arange(len(mine.landmark_id)), jnp.arange(len(weight))
 
-    def one(birth, centre):
+    def one(landmark_id, centre):
         # Births of one frame may be in other slots where a particle had more of them.
-        same = (world.birth == birth) & (world.count > 0)
+        same = (world.landmark_id == landmark_id) & (world.count > 0)
         at = jnp.where(same, slots[:, None], -1).max(0)
         row = jax.tree.map(lambda leaf: leaf[..., jnp.maximum(at, 0), lane], world)
-        row, share = sharding.whole((row, weight * (at >= 0)), config)
+        row, share = sharding.all_gather((row, weight * (at >= 0)), config)
         point, cov, known = to_world(config.sensor, row)
         share = jnp.where(known, share, 0)
         # Pinned: joined with what comes before, sums would be rounded by the number of devices.
-        share = pinned(share / pinned(share).sum())
+        share = barrier(share / barrier(share).sum())
         dx, dy = (jnp.where(known, p - c, 0) for p, c in zip(point, centre, strict=True))
-        mx, my = pinned(jnp.stack([share * dx, share * dy])).sum(1)
+        mx, my = barrier(jnp.stack([share * dx, share * dy])).sum(1)
         spread = ((dx - mx) ** 2, (dx - mx) * (dy - my), (dy - my) ** 2)
         parts = [
             jnp.where(share > 0, share * (own + between), 0)
             for own, between in zip(cov, spread, strict=True)
         ]
-        return jnp.stack([centre[0] + mx, centre[1] + my]), pinned(jnp.stack(parts)).sum(1)
+        return jnp.stack([centre[0] + mx, centre[1] + my]), barrier(jnp.stack(parts)).sum(1)
 
-    mean, cov = jax.lax.map(lambda args: one(*args), (mine.birth, jnp.stack(centre, -1)))
+    mean, cov = jax.lax.map(lambda args: one(*args), (mine.landmark_id, jnp.stack(centre, -1)))
     kept = (mine.count > 0) & confirmed & depth_known
-    return Table(mean.T, cov.T, mine.count, mine.birth, kept)
+    return LandmarkTable(mean.T, cov.T, mine.count, mine.landmark_id, kept)
 
 
 def to_world(sensor, world):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from jaxslam.filter.association import NEW
 from jaxslam.filter.landmarks import Landmarks
-from jaxslam.filter.xla import listed, pinned
+from jaxslam.filter.xla import barrier, nonzero_indices
 from jaxslam.models import sensors
 
 AT_ONCE = 16
@@ -31,10 +31,10 @@ def create(config, world, start, sensor_pose, match, free, measurements, params,
     total, slots, width = len(match), world.count.shape[0], match.shape[1]
     slot, lanes, count, touched, lost = jax.lax.cond(
         (match == NEW).any(),
-        lambda *given: _planned(config, slots, *given),
+        lambda *given: _plan(config, slots, *given),
         lambda *given: jax.tree.map(
             lambda part: jnp.zeros(part.shape, part.dtype),
-            jax.eval_shape(lambda *given: _planned(config, slots, *given), *given),
+            jax.eval_shape(lambda *given: _plan(config, slots, *given), *given),
         ),
         match,
         free,
@@ -43,7 +43,7 @@ def create(config, world, start, sensor_pose, match, free, measurements, params,
     value, cov = (tuple(part.T[:, :, None]) for part in map(jnp.asarray, measurements[:2]))
     forgetting = world.log_odds is not None
     odds = jnp.minimum(params.existence_new, params.existence_max)
-    birth = (step_number * total + jnp.arange(total))[:, None].astype(jnp.int32)
+    landmark_id = (step_number * total + jnp.arange(total))[:, None].astype(jnp.int32)
 
     def some(carry):
         i, world = carry
@@ -51,7 +51,7 @@ def create(config, world, start, sensor_pose, match, free, measurements, params,
         there, lane = lane < width, jnp.minimum(lane, width - 1)
         to = jnp.where(there, slot[:, lane], slots)  # beyond: dropped
         # Arrays of their own: fused, what rounds them would depend on the shape of the block.
-        here = pinned(tuple(part[lane] for part in sensor_pose))
+        here = barrier(tuple(part[lane] for part in sensor_pose))
         mean, factor, anchor = sensors.locate(config.sensor, here, value, cov, params)
 
         def whole(parts):
@@ -64,7 +64,7 @@ def create(config, world, start, sensor_pose, match, free, measurements, params,
             log_odds=odds if forgetting else None,
             # With odds against it from the start it is forgotten at once.
             count=(odds >= 0).astype(jnp.int32) if forgetting else 1,
-            birth=jnp.broadcast_to(birth, to.shape),
+            landmark_id=jnp.broadcast_to(landmark_id, to.shape),
         )
 
         def put(leaf, new):
@@ -76,7 +76,7 @@ def create(config, world, start, sensor_pose, match, free, measurements, params,
     return world, touched, lost
 
 
-def _planned(config, slots, match, free, identity):
+def _plan(config, slots, match, free, identity):
     """Where births go: slots [K, n]; the particles that have any, listed, and how many; slots [M]
     in which there is one; and how many find none [n]."""
     new = match == NEW
@@ -93,13 +93,13 @@ def _planned(config, slots, match, free, identity):
         taken = jnp.where(jnp.arange(total) < nth[-1].max(), free, slots)
         slot = free[jnp.maximum(nth - 1, 0)]
     slot = jnp.where(new, slot, slots).astype(jnp.int32)
-    lanes, count = listed(some)
+    lanes, count = nonzero_indices(some)
     lanes = jnp.pad(lanes, (0, AT_ONCE), constant_values=match.shape[1])
     touched = (taken[:, None] == jnp.arange(slots)).any(0)
     return slot, lanes, count, touched, (new & (slot >= slots)).sum(0).astype(jnp.int32)
 
 
-def given(world, known):
+def place_given(world, known):
     """The map with its first slots set to a given one: mean [2, L], factor [3, L] (, anchor).
 
     A given landmark is certain to exist until it has been seen.
@@ -110,7 +110,7 @@ def given(world, known):
         raise ValueError(f"{size} landmarks given, but the map has {world.count.shape[0]} slots")
     return world._replace(
         count=world.count.at[:size].set(1),
-        birth=world.birth.at[:size].set(-jnp.arange(4, 4 + size, dtype=jnp.int32)[:, None]),
+        landmark_id=world.landmark_id.at[:size].set(-jnp.arange(4, 4 + size, dtype=jnp.int32)[:, None]),
         log_odds=None if world.log_odds is None else world.log_odds.at[:size].set(jnp.inf),
         **{
             name: getattr(world, name).at[:, :size].set(jnp.asarray(value)[:, :, None])

@@ -25,7 +25,7 @@ class Whitened(NamedTuple):
     log_det: jax.Array
 
 
-def axes(before, predicted, sensor_pose, odometry, params):
+def motion_axes(before, predicted, sensor_pose, odometry, params):
     """Derivatives of the sensor's predicted pose by u: three (x, y, heading).
 
     `before`, `predicted`: the robot's poses, of which the second is `motion.sample`'s at u = 0.
@@ -37,7 +37,7 @@ def axes(before, predicted, sensor_pose, odometry, params):
     ]
 
 
-def rows(sensor, sensor_pose, axes, mean, anchor, value):
+def pose_jacobian(sensor, sensor_pose, axes, mean, anchor, value):
     """Derivatives by u of a landmark's predicted measurement: a row (3) for each component.
 
     `value`: that prediction. As in `sensors.observe`, everything broadcasts.
@@ -74,7 +74,7 @@ def inform(sensor, sensor_pose, axes, world, match, measurements, params):
         mean, factor = tuple(world.mean[:, slot, lane]), tuple(world.factor[:, slot, lane])
         anchor = None if world.anchor is None else tuple(world.anchor[:, slot, lane])
         seen = sensors.observe(sensor, sensor_pose, mean, anchor, params)
-        by_u = rows(sensor, sensor_pose, axes, mean, anchor, seen.value)
+        by_u = pose_jacobian(sensor, sensor_pose, axes, mean, anchor, seen.value)
         value, cov = measurements.value[k], measurements.cov[k]
         for h, rest, variance in _independent(sensor, seen, factor, by_u, value, cov, params):
             whitened = _update(whitened, h, rest, variance, matched)
@@ -88,7 +88,9 @@ def _independent(sensor, seen, factor, by_u, value, cov, params):
     spread = [geometry.transpose_times(factor, row) for row in seen.rows]
     v0 = value[0] - seen.value[0]
     if sensor == "bearing":
-        shift, extra = landmarks.bend(spread[0], geometry.transpose_times(factor, seen.stretch))
+        shift, extra = landmarks.turn_factor(
+            spread[0], geometry.transpose_times(factor, seen.stretch)
+        )
         s00 = spread[0][0] ** 2 + spread[0][1] ** 2 + extra + seen.noise[0]
         return [(by_u[0], wrap(v0 - shift), s00)]
     v1 = value[1] - seen.value[1]

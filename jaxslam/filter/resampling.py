@@ -37,11 +37,11 @@ def gather(tree, ancestors, wanted, config):
     copy of the map and run at a fraction of the speed. Unwanted is a loop of no rounds, where a
     `cond` would copy the map. A device has its share of the leaves.
     """
-    ancestors = sharding.mine(ancestors, config)
+    ancestors = sharding.local_shard(ancestors, config)
 
     def one(i, parts):
         part = jax.lax.dynamic_index_in_dim(parts, i, keepdims=False)
-        (part,) = sharding.taken([part], [ancestors], config)
+        (part,) = sharding.gather([part], [ancestors], config)
         return jax.lax.dynamic_update_index_in_dim(parts, part, i, 0)
 
     def gather_leaf(leaf):

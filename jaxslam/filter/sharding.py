@@ -14,7 +14,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
-from jaxslam.filter.xla import pinned
+from jaxslam.filter.xla import barrier
 
 AXIS = "particles"
 ALL = PartitionSpec()  # the same on every device
@@ -42,7 +42,7 @@ def mesh_of(count):
     return jax.sharding.Mesh(np.array(found), (AXIS,), (AxisType.Auto,))
 
 
-def fetched(leaf):
+def to_host(leaf):
     """A whole array on this host; every process that shares it must ask, and gets it.
 
     On a CPU it may be the device's own memory: not to be kept, or the device could not work on it
@@ -72,7 +72,7 @@ def _rows(leaf, start, some, sharding):
     return jax.lax.with_sharding_constraint(part, sharding)
 
 
-def sent(array, shape):
+def to_devices(array, shape):
     """An array on the devices, a copy: of NumPy's, as `shape` (`ShapeDtypeStruct`) says."""
     if shape.sharding is None:
         return jnp.array(array)
@@ -81,14 +81,14 @@ def sent(array, shape):
     )
 
 
-def agreed(number):
+def broadcast_int(number):
     """A whole number of process 0, told to all processes; every one of them must ask."""
     if jax.process_count() == 1:
         return number
     return int(multihost_utils.broadcast_one_to_all(np.int32(number)))
 
 
-def told(tree):
+def broadcast(tree):
     """Arrays of process 0 (the others' count for their shapes), told to all processes; every one of
     them must ask."""
     if jax.process_count() == 1:
@@ -96,17 +96,17 @@ def told(tree):
     return jax.tree.map(np.asarray, multihost_utils.broadcast_one_to_all(tree))
 
 
-def leads():
+def is_leader():
     """Whether this process speaks and writes for all."""
     return jax.process_index() == 0
 
 
-def lanes(tree):
+def particle_sharded(tree):
     """`PartitionSpec` of every leaf [..., N] of a tree: the last axis is shared out."""
     return jax.tree.map(lambda leaf: PartitionSpec(*[None] * (leaf.ndim - 1), AXIS), tree)
 
 
-def same(tree):
+def replicated(tree):
     """`PartitionSpec` of every leaf of a tree: all of it on each device."""
     return jax.tree.map(lambda leaf: ALL, tree)
 
@@ -123,7 +123,7 @@ def shardings(specs, config):
     )
 
 
-def divided(function, specs, outcome, config):
+def shard_map(function, specs, outcome, config):
     """The function on every device, with its share of the arguments; as it is for one device."""
     if config.devices == 1:
         return function
@@ -133,21 +133,21 @@ def divided(function, specs, outcome, config):
     )
 
 
-def whole(tree, config):
+def all_gather(tree, config):
     """Leaves [..., N] of all particles, on every device, of leaves [..., n] of its own."""
     if config.devices == 1:
-        return pinned(tree)
+        return barrier(tree)
     leaves, kind = jax.tree.flatten(tree)
     found = list(leaves)
-    for every, rows in _gathered(leaves):
+    for every, rows in _gather_packed(leaves):
         every = jnp.moveaxis(every, 0, 1).reshape(every.shape[1], -1)
         for i, begin, end in rows:
             part = every[begin:end].reshape(*leaves[i].shape[:-1], -1)
             found[i] = jax.lax.bitcast_convert_type(part, leaves[i].dtype)
-    return pinned(jax.tree.unflatten(kind, found))
+    return barrier(jax.tree.unflatten(kind, found))
 
 
-def taken(trees, indices, config):
+def gather(trees, indices, config):
     """Of each tree the leaves [..., n] at `indices` [n] of all particles, wherever these are."""
     leaves, kind = jax.tree.flatten(trees)
     each, found = len(leaves) // len(indices), list(leaves)
@@ -156,10 +156,10 @@ def taken(trees, indices, config):
             rows = np.arange(leaf.size // leaf.shape[-1], dtype=np.int32).reshape(leaf.shape[:-1])
             found[i] = _at(leaf, rows, indices[i // each])
         return jax.tree.unflatten(kind, found)
-    for every, parts in _gathered(leaves):
+    for every, parts in _gather_packed(leaves):
         count, n = every.shape[1:]
         # Of a particle's first number, in the order that things came in.
-        first = pinned([index // n * (count * n) + index % n for index in indices])
+        first = barrier([index // n * (count * n) + index % n for index in indices])
         for i, begin, end in parts:
             rows = np.arange(begin, end, dtype=np.int32).reshape(leaves[i].shape[:-1])
             part = _at(every, rows, first[i // each])
@@ -173,15 +173,15 @@ def _at(array, rows, index):
     return array.reshape(-1).at[at].get(mode="promise_in_bounds")
 
 
-def _gathered(leaves):
+def _gather_packed(leaves):
     """The same leaves [..., n] of all devices, in few large messages (a small one costs as much as
     some ten thousand numbers): of every width of number an array [devices, rows, n], as it comes,
     and which rows (leaf, from, to) are whose."""
-    for rows, whose in _joined(leaves):
+    for rows, whose in _pack(leaves):
         yield jax.lax.all_gather(rows, AXIS), whose
 
 
-def _joined(leaves):
+def _pack(leaves):
     """Of every width of number an array [rows, n] of the leaves [..., n], and whose rows are whose
     (leaf, from, to)."""
     n = leaves[0].shape[-1]
@@ -193,11 +193,11 @@ def _joined(leaves):
         yield jnp.concatenate(rows), list(zip(these, ends[:-1], ends[1:], strict=True))
 
 
-def of_neighbours(leaves, b, config):
+def exchange_with_neighbours(leaves, b, config):
     """Of leaves [..., 2 b], every device's first and last b: the last of the device before, and the
     first of the one after it (zeros where there is none)."""
     found, pairs = list(leaves), range(config.devices - 1)
-    for rows, whose in _joined(leaves):
+    for rows, whose in _pack(leaves):
         before = jax.lax.ppermute(rows[:, b:], AXIS, [(i, i + 1) for i in pairs])
         after = jax.lax.ppermute(rows[:, :b], AXIS, [(i + 1, i) for i in pairs])
         both = jnp.concatenate([before, after], 1)
@@ -207,7 +207,7 @@ def of_neighbours(leaves, b, config):
     return found
 
 
-def mine(tree, config):
+def local_shard(tree, config):
     """Leaves [..., n] of a device's own particles, of leaves [..., N] of all."""
     if config.devices == 1:
         return tree
@@ -218,19 +218,19 @@ def mine(tree, config):
     )
 
 
-def least(values, config):
+def all_min(values, config):
     """The least of the devices' values, each for itself; what is not a number stays."""
     if config.devices == 1:
         return values
     return jax.lax.all_gather(values, AXIS).min(0)
 
 
-def total(counts, config):
+def all_sum(counts, config):
     """Sum of whole numbers over the devices."""
     return counts if config.devices == 1 else jax.lax.psum(counts, AXIS)
 
 
-def one(tree, lane, config):
+def select_particle(tree, lane, config):
     """Leaves [...] of one particle of all, of leaves [..., n] of a device's own."""
     if config.devices == 1:
         return jax.tree.map(lambda leaf: leaf[..., lane], tree)
@@ -238,7 +238,7 @@ def one(tree, lane, config):
     return jax.tree.map(lambda leaf: jax.lax.all_gather(leaf[..., at], AXIS)[holder], tree)
 
 
-def spread(one, items, count):
+def map_over_devices(one, items, count):
     """`one` of every item (first axis), shared out over so many devices; on each, one at a time."""
     total = len(jax.tree.leaves(items)[0])
     if count == 1 or total == 1:

@@ -25,13 +25,13 @@ from jaxslam.filter import (
     resampling,
     sharding,
 )
-from jaxslam.filter.appearance import Looks
+from jaxslam.filter.appearance import Appearances
 from jaxslam.filter.association import CLUTTER, NEW
-from jaxslam.filter.block_update import Chance
+from jaxslam.filter.block_update import RandomNumbers
 from jaxslam.filter.landmarks import Landmarks
 from jaxslam.filter.lazy_resampling import Ancestry
-from jaxslam.filter.weights import Estimate, estimated, weigh
-from jaxslam.filter.xla import pinned
+from jaxslam.filter.weights import Estimate, estimate_pose, weigh
+from jaxslam.filter.xla import barrier
 from jaxslam.models.geometry import wrap
 
 
@@ -44,17 +44,17 @@ class State(NamedTuple):
     landmarks: Landmarks
     log_weight: jax.Array
     step: jax.Array
-    bounds: candidate_slots.Bounds
+    bounds: candidate_slots.SlotBounds
     ancestry: Ancestry | None
-    looks: Looks | None
+    looks: Appearances | None
 
 
 class Info(NamedTuple):
     """What is known about one step; counts are over all particles.
 
     `pose` [3, N] and `log_weight` [N] of all particles, before resampling. `match` [K, N]: slot
-    matched, or -1 new, -2 clutter, -3 padding. `birth` [K, N]: the same as births
-    (`Landmarks.birth`) of the landmarks matched. `log_choice` [N]: log probability with which the
+    matched, or -1 new, -2 clutter, -3 padding. `landmark_id` [K, N]: the same as births
+    (`Landmarks.landmark_id`) of the landmarks matched. `log_choice` [N]: log probability with which the
     matches were drawn (0: they were not). `ancestors` [N]: which of these particles each particle
     after resampling continues. `new`: landmarks that the best particle began. `overflow`: landmarks
     lost for want of a slot. `nonfinite`: particles whose weight became NaN or infinite.
@@ -69,7 +69,7 @@ class Info(NamedTuple):
     resampled: jax.Array
     ancestors: jax.Array
     match: jax.Array
-    birth: jax.Array
+    landmark_id: jax.Array
     log_choice: jax.Array
     new: jax.Array
     outliers: jax.Array
@@ -87,10 +87,10 @@ def init(config, key, pose=(0.0, 0.0, 0.0), cov=None, landmarks_given=None):
     Raises `ValueError` where there are fewer devices than `Config.devices`.
     """
     cov = np.zeros((3, 3)) if cov is None else cov
-    return made(_start, config, key, pose, cov, landmarks_given)
+    return make_on_devices(_start, config, key, pose, cov, landmarks_given)
 
 
-def made(make, config, *given):
+def make_on_devices(make, config, *given):
     """The `State` of a jitted function (*given, config), made where it belongs: it may fit no one
     device."""
     if config.devices == 1:
@@ -100,7 +100,7 @@ def made(make, config, *given):
     return jax.jit(make, out_shardings=sharding.shardings(specs, config))(*given)
 
 
-def fresh(pose, world, step, bounds, config):
+def fresh_state(pose, world, step, bounds, config):
     """`State` of particles of equal weight, with nothing to catch up with."""
     n = config.particles
     return State(
@@ -109,7 +109,9 @@ def fresh(pose, world, step, bounds, config):
         log_weight=jnp.full(n, -jnp.log(n), pose.dtype),
         step=jnp.asarray(step, jnp.int32),
         bounds=bounds,
-        ancestry=lazy_resampling.new(config) if config.lazy and config.resample_threshold else None,
+        ancestry=lazy_resampling.empty_ancestry(config)
+        if config.lazy and config.resample_threshold
+        else None,
         looks=appearance.empty(config, pose.dtype),
     )
 
@@ -118,73 +120,77 @@ def fresh(pose, world, step, bounds, config):
 def _start(key, pose, cov, landmarks_given, config):
     n = config.particles
     pose = jnp.asarray(pose, float)
-    root = square_root(jnp.asarray(cov, float))
+    root = matrix_square_root(jnp.asarray(cov, float))
     # Products one by one: a matrix product rounds by the device.
-    normals = start_draws(key, config).astype(pose.dtype)
+    normals = draw_start(key, config).astype(pose.dtype)
     drawn = pose[:, None] + sum(root[:, i, None] * normals[i] for i in range(3))
     one = landmarks.empty(dataclasses.replace(config, particles=1, devices=1), pose.dtype)
     if landmarks_given is not None:
-        one = new_landmarks.given(one, landmarks_given)
+        one = new_landmarks.place_given(one, landmarks_given)
     world = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*leaf.shape[:-1], n)), one)
-    return fresh(drawn.at[2].set(wrap(drawn[2])), world, 0, candidate_slots.of_rows(one), config)
+    return fresh_state(
+        drawn.at[2].set(wrap(drawn[2])), world, 0, candidate_slots.bounds_of(one), config
+    )
 
 
 @partial(jax.jit, static_argnames="config")
-def settled(state, config):
+def settle(state, config):
     """The state with every landmark where its particle is: to read the map, not to go on faster."""
     if state.ancestry is None:
         return state
 
     def update(world, past):
-        return lazy_resampling.update(world, past, True, config)
+        return lazy_resampling.apply_ancestry(world, past, True, config)
 
     specs = layout(state)
     specs = specs.landmarks, specs.ancestry
-    world, past = sharding.divided(update, specs, specs, config)(state.landmarks, state.ancestry)
+    world, past = sharding.shard_map(update, specs, specs, config)(state.landmarks, state.ancestry)
     return state._replace(landmarks=world, ancestry=past)
 
 
-def square_root(cov):
+def matrix_square_root(cov):
     """A square root of a covariance: Cholesky's, or the symmetric eigenvectors' if singular."""
     factor = jnp.linalg.cholesky(cov)
     values, vectors = jnp.linalg.eigh(cov)
     return jnp.where(jnp.isfinite(factor).all(), factor, vectors * jnp.sqrt(jnp.maximum(values, 0)))
 
 
-def start_draws(key, config):
+def draw_start(key, config):
     """Standard normals [3, N] behind the start poses."""
     return jax.random.normal(jax.random.fold_in(key, 2**31 - 1), (3, config.particles), float)
 
 
-def draws(key, step, config):
+def draw_random_numbers(key, step, config):
     """`Chance` of a step, set by its absolute number alone."""
     move, choose = jax.random.split(jax.random.fold_in(key, step))
     normals = jax.random.normal(move, (3, config.particles), float)
     uniform = jax.random.uniform(choose, (), float)
     if config.association != "sampled":
-        return Chance(normals, uniform)
+        return RandomNumbers(normals, uniform)
     shape = config.measurements, config.particles
-    return Chance(normals, uniform, jax.random.uniform(jax.random.fold_in(choose, 1), shape, float))
+    return RandomNumbers(
+        normals, uniform, jax.random.uniform(jax.random.fold_in(choose, 1), shape, float)
+    )
 
 
 def layout(state):
     """How the leaves of a `State` lie on several devices."""
-    return sharding.same(state)._replace(
-        pose=sharding.lanes(state.pose),
-        landmarks=sharding.lanes(state.landmarks),
-        log_weight=sharding.lanes(state.log_weight),
+    return sharding.replicated(state)._replace(
+        pose=sharding.particle_sharded(state.pose),
+        landmarks=sharding.particle_sharded(state.landmarks),
+        log_weight=sharding.particle_sharded(state.log_weight),
     )
 
 
 @partial(jax.jit, static_argnames="config")
 def step(key, state, odometry, measurements, params, config):
     """One step: move, associate and weigh, update, resample. Returns (State, Info)."""
-    given = draws(key, state.step, config), state, odometry, measurements, params
+    given = draw_random_numbers(key, state.step, config), state, odometry, measurements, params
     if config.devices == 1:
         return advance(*given, config)
     rest = sharding.ALL
-    chance = sharding.lanes(given[0]._replace(uniform=None))._replace(uniform=rest)
-    return sharding.divided(
+    chance = sharding.particle_sharded(given[0]._replace(uniform=None))._replace(uniform=rest)
+    return sharding.shard_map(
         partial(advance, config=config),
         (chance, layout(state), rest, rest, rest),
         (layout(state), _info_specs()),
@@ -194,8 +200,8 @@ def step(key, state, odometry, measurements, params, config):
 
 def _info_specs():
     row, table = jax.ShapeDtypeStruct((1,), float), jax.ShapeDtypeStruct((1, 1), float)
-    shared = sharding.lanes(
-        dict(pose=table, log_weight=row, match=table, birth=table, log_choice=row)
+    shared = sharding.particle_sharded(
+        dict(pose=table, log_weight=row, match=table, landmark_id=table, log_choice=row)
     )
     return Info(**dict.fromkeys(Info._fields, sharding.ALL) | shared)
 
@@ -209,17 +215,17 @@ def advance(chance, state, odometry, measurements, params, config):
 def conclude(chance, state, seen, measurements, config):
     """The second half of a step: weights of what was `seen` (`Observed`), estimate, resampling."""
     # Of all particles: every device works out the same from the same.
-    pose, density, before = sharding.whole((seen.pose, seen.density, state.log_weight), config)
+    pose, density, before = sharding.all_gather((seen.pose, seen.density, state.log_weight), config)
     # A pose that is not a number fits nothing, which would count as new landmarks: no weight.
     sound = jnp.isfinite(pose).all(0)
     density = jnp.where(sound, density, jnp.nan)
     log_weight, log_evidence, flags = weigh(before, density)
-    weight = pinned(jnp.exp(log_weight))
-    estimate = estimated(jnp.where(sound, pose, 0), weight)
+    weight = barrier(jnp.exp(log_weight))
+    estimate = estimate_pose(jnp.where(sound, pose, 0), weight)
     ess = 1 / jnp.sum(weight**2)
     threshold = config.resample_threshold
     wanted = measurements.active & ((ess < threshold * config.particles) | (threshold >= 1))
-    match, birth = sharding.one((seen.match, seen.birth), estimate.best, config)
+    match, landmark_id = sharding.select_particle((seen.match, seen.landmark_id), estimate.best, config)
     moved = State(
         pose,
         seen.landmarks,
@@ -229,22 +235,24 @@ def conclude(chance, state, seen, measurements, config):
         seen.ancestry,
         None
         if seen.looks is None
-        else appearance.learnt(seen.looks, match, birth, seen.free, state.step, measurements),
+        else appearance.update_appearances(
+            seen.looks, match, landmark_id, seen.free, state.step, measurements
+        ),
     )
     resampled, ancestors = _resample(moved, wanted, chance.uniform, config)
-    overflow, forgotten, outliers = sharding.total(
+    overflow, forgotten, outliers = sharding.all_sum(
         jnp.stack([*seen.counts.sum(1), jnp.sum(seen.match == CLUTTER, dtype=jnp.int32)]), config
     )
     info = Info(
         pose=seen.pose,
-        log_weight=sharding.mine(log_weight, config),
+        log_weight=sharding.local_shard(log_weight, config),
         estimate=estimate,
         ess=ess,
         log_evidence=log_evidence,
         resampled=wanted,
         ancestors=ancestors,
         match=seen.match,
-        birth=seen.birth,
+        landmark_id=seen.landmark_id,
         log_choice=seen.log_choice,
         new=jnp.sum(match == NEW),
         outliers=outliers,
@@ -277,14 +285,14 @@ def _resample(state, wanted, uniform, config):
     pose, log_weight = state.pose, state.log_weight
     world, past = state.landmarks, state.ancestry
     if config.resample_threshold:
-        chosen = pinned(resampling.systematic(log_weight, uniform))
+        chosen = barrier(resampling.systematic(log_weight, uniform))
         ancestors = jnp.where(wanted, chosen, ancestors)
         pose = pose[:, ancestors]
         log_weight = jnp.where(wanted, -jnp.log(n), log_weight)
         if past is None:
             world = resampling.gather(world, ancestors, wanted, config)
         else:
-            past = lazy_resampling.resampled(past, ancestors, wanted)
-    pose, log_weight = sharding.mine((pose, log_weight), config)
+            past = lazy_resampling.compose(past, ancestors, wanted)
+    pose, log_weight = sharding.local_shard((pose, log_weight), config)
     state = state._replace(pose=pose, landmarks=world, log_weight=log_weight, ancestry=past)
     return state, ancestors

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam.filter.xla import pinned
+from jaxslam.filter.xla import barrier
 from jaxslam.models.geometry import wrap
 
 
@@ -19,7 +19,7 @@ class Estimate(NamedTuple):
 
 def weigh(log_weight, density):
     """Normalised log weights, log evidence of the step, and flags (non-finite, degenerate)."""
-    raw = pinned(log_weight + density)
+    raw = barrier(log_weight + density)
     finite = jnp.isfinite(raw)
     # A particle that already had no weight is not news.
     nonfinite = jnp.sum(~finite & (log_weight > -jnp.inf))
@@ -27,17 +27,17 @@ def weigh(log_weight, density):
     log_evidence = jax.nn.logsumexp(jnp.where(finite, raw, -jnp.inf))
     even = jnp.full_like(raw, -jnp.log(len(raw)))
     normalised = jnp.where(finite, raw - log_evidence, -jnp.inf)
-    log_weight = pinned(jnp.where(degenerate, even, normalised))
+    log_weight = barrier(jnp.where(degenerate, even, normalised))
     return log_weight, log_evidence, (nonfinite, degenerate)
 
 
-def estimated(pose, weight):
+def estimate_pose(pose, weight):
     """Weighted mean (circular in heading) and covariance of the poses, and the heaviest one."""
     # Sums, not matrix products: how these add up depends on the number of threads.
     x, y, heading = pose
     parts = jnp.stack([x, y, jnp.sin(heading), jnp.cos(heading)])
-    x_mean, y_mean, s, c = pinned(parts * weight).sum(1)
+    x_mean, y_mean, s, c = barrier(parts * weight).sum(1)
     mean = jnp.stack([x_mean, y_mean, jnp.arctan2(s, c)])
-    off = pinned(jnp.stack([x - mean[0], y - mean[1], wrap(heading - mean[2])]))
-    cov = pinned(off[:, None] * (off * weight)).sum(2)
+    off = barrier(jnp.stack([x - mean[0], y - mean[1], wrap(heading - mean[2])]))
+    cov = barrier(off[:, None] * (off * weight)).sum(2)
     return Estimate(mean, cov, jnp.argmax(weight))

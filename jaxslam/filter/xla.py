@@ -7,7 +7,7 @@ import numpy as np
 WIDTH = 32
 
 
-def listed(mask, size=None):
+def nonzero_indices(mask, size=None):
     """Indices [size] (int32; None: all that could be) where a mask [n] is true, in order, and how
     many there are; the rest is n.
 
@@ -27,14 +27,14 @@ def listed(mask, size=None):
     return index, count
 
 
-def rounds(count, body, start):
+def repeat(count, body, start):
     """`jax.lax.fori_loop` from 0 to a count worked out."""
     return jax.lax.while_loop(
         lambda carry: carry[0] < count, lambda carry: (carry[0] + 1, body(*carry)), (0, start)
     )[1]
 
 
-def added(rows):
+def ordered_sum(rows):
     """Sum over the first axis, from the first row to the last.
 
     The order of `jnp.sum` depends on the array's shape, and so on how many particles are worked on
@@ -45,7 +45,7 @@ def added(rows):
     return jax.lax.fori_loop(0, len(rows), lambda i, total: total + rows[i], start, unroll=unroll)
 
 
-def pinned(tree):
+def barrier(tree):
     """The same arrays, made where this stands and nowhere else.
 
     XLA works cheap things out anew in each fusion that uses them, and joins other products and
@@ -54,7 +54,7 @@ def pinned(tree):
     return jax.lax.optimization_barrier(tree)
 
 
-def once(sure, work):
+def compute_once(sure, work):
     """What `work` returns, as arrays: a branch ends fusion. `sure` is true, but not so that XLA can
     tell.
 
@@ -70,7 +70,7 @@ def once(sure, work):
     return jax.lax.cond(sure, work, never)
 
 
-def corner(leaf, slot, start, *before):
+def row_start(leaf, slot, start, *before):
     """Where a slot's row begins, at places `before` (0: all); indices of one type, also in double
     precision."""
     before = before or (0,) * (leaf.ndim - 2)

@@ -9,12 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.files import replacing
+from jaxslam.files import atomic_write
 
 
 def fingerprint_of(settings, data):
-    """What a checkpoint belongs to."""
-    digest = hashlib.sha256(repr(settings).encode())
+    """Digest of what a checkpoint belongs to: settings and logs.
+
+    The settings' text is the one of version 0.1, whose checkpoints can still be resumed.
+    """
+    text = repr(settings).replace(type(settings).__name__, "_Told", 1)
+    digest = hashlib.sha256(text.encode())
     for leaf in jax.tree.leaves(data):
         digest.update(np.ascontiguousarray(leaf).tobytes())
     return digest.hexdigest()
@@ -26,7 +30,7 @@ def save_state(path, fingerprint, state):
     told = {"rows": state.rows, "judgements": state.judgements, "stopped": state.stopped}
     text = json.dumps(told, default=lambda array: array.tolist())
     arrays = {f"optimiser{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
-    with replacing(Path(path)) as file:
+    with atomic_write(Path(path)) as file:
         np.savez(
             file, fingerprint=fingerprint, step=state.step, free=state.free, told=text, **arrays
         )

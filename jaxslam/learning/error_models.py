@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.config import UNITS
-from jaxslam.filter.frames import frames
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.learning import fit
 from jaxslam.learning.likelihood import OF_MOTION
 
@@ -97,7 +97,7 @@ def _without_points(log):
 def _ranges(log, config, params):
     """Ranges [n] of the measurements that find a slot (ones, where none was measured)."""
     known = config.association == "known"
-    row = frames(log, config.sensor, config.measurements, params, known).row
+    row = frames_from_log(log, config.sensor, config.measurements, params, known).row
     ranges = np.ones(len(log.frame)) if log.range is None else log.range
     return ranges[row[row >= 0]]
 

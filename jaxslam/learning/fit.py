@@ -24,7 +24,7 @@ from jaxslam.config import Params
 from jaxslam.filter import sharding
 from jaxslam.learning import likelihood
 from jaxslam.learning.checkpoint import fingerprint_of, load_state, save_state
-from jaxslam.learning.transforms import SCALE, from_free, plain, put, taken, to_free
+from jaxslam.learning.transforms import SCALE, free_vector, from_free, to_free, to_params, with_free
 from jaxslam.parameter_file import validate
 
 TAIL = 0.3  # share of the steps whose mean is the estimate
@@ -77,10 +77,10 @@ def default_names(config):
     return tuple(n for n in names if n in allowed and not (bearing and n == "gain_tran"))
 
 
-def stacked(logs, config, params):
+def stack_logs(logs, config, params):
     """`likelihood.Data` of several logs, with a first axis, filled up to the longest."""
     longest = max(len(log.frame_time) for log in logs)
-    made = [likelihood.data_of(log, config, params, longest) for log in logs]
+    made = [likelihood.data_from_log(log, config, params, longest) for log in logs]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *made)
 
 
@@ -93,22 +93,22 @@ def scores(free, params, data, which, keys, config, names, discount, estimator="
 
     def one(item):
         at, log, key = item
-        given = put(params, names, at)
+        given = with_free(params, names, at)
         mine = jax.tree.map(lambda leaf: leaf[log], data)
         if not names:
             value = likelihood.value(given, mine, key, config)
             return likelihood.Score(jnp.zeros(0), value, None, None, None)
-        found = likelihood.scored(given, mine, key, config, names, estimator, discount)
+        found = likelihood.score_and_value(given, mine, key, config, names, estimator, discount)
         by_free = jax.vmap(jnp.multiply, (-1, 0), -1)
         slope = jnp.stack([jax.grad(partial(from_free, n))(at[i]) for i, n in enumerate(names)])
         return found._replace(total=by_free(found.total, slope), steps=by_free(found.steps, slope))
 
-    return sharding.spread(one, (free, which, keys), len(jax.devices()))
+    return sharding.map_over_devices(one, (free, which, keys), len(jax.devices()))
 
 
 def evidence(logs, config, params, seeds=8, seed=0):
     """Log likelihood [seeds] summed over logs, by seed."""
-    data = logs if isinstance(logs, likelihood.Data) else stacked(logs, config, params)
+    data = logs if isinstance(logs, likelihood.Data) else stack_logs(logs, config, params)
     count = len(data.start_pose)
     which = np.repeat(np.arange(count), seeds)
     keys = jax.random.split(jax.random.key(seed), count * seeds)
@@ -117,7 +117,7 @@ def evidence(logs, config, params, seeds=8, seed=0):
     return np.asarray(found.log_likelihood, float).reshape(count, seeds).sum(0)
 
 
-class _Told(NamedTuple):
+class FitSettings(NamedTuple):
     """What `fit` was asked, but for the logs."""
 
     config: object
@@ -169,13 +169,13 @@ def fit(
     begin = time.perf_counter()
     names = default_names(config) if names is None else tuple(names)
     params = validate(params, "params")
-    told = _Told(config, params, names, dict(bounds or {}), dict(priors or {}), seeds,
+    told = FitSettings(config, params, names, dict(bounds or {}), dict(priors or {}), seeds,
                  held_out_seeds, steps, rate, min(batch or len(logs), len(logs)), every, patience,
                  seed)  # fmt: skip
     _check(told, logs)
-    data = stacked(logs, config, params)
-    judged = stacked(held_out, config, params) if held_out else None
-    taught = _Teacher(told, data, judged)
+    data = stack_logs(logs, config, params)
+    judged = stack_logs(held_out, config, params) if held_out else None
+    taught = _Trainer(told, data, judged)
     state = taught.start()
     fingerprint = fingerprint_of(told, (data, judged))
     if resume:
@@ -187,7 +187,7 @@ def fit(
         if progress:
             progress(state.step, steps, record)
     free, stopped = taught.estimate(state)
-    return Fit(names, params, validate(plain(params, names, free), "the fit"), free,
+    return Fit(names, params, validate(to_params(params, names, free), "the fit"), free,
                state.history(), stopped, config, seed, state.step,
                time.perf_counter() - begin)  # fmt: skip
 
@@ -201,7 +201,7 @@ def _check(told, logs):
     for name in ("seeds", "steps", "every", "patience", "held_out_seeds"):
         if getattr(told, name) < 1:
             raise ValueError(f"{name} is {getattr(told, name)}; must be 1 or more")
-    start = dict(zip(told.names, taken(told.params, told.names), strict=True))
+    start = dict(zip(told.names, free_vector(told.params, told.names), strict=True))
     for name in {**told.bounds, **told.priors}:
         if name not in start:
             raise ValueError(f"{name} has bounds or a prior, but is not learnt")
@@ -227,7 +227,7 @@ class _State(NamedTuple):
         return History(*rows, *(judged or [np.empty(0)] * 4))
 
 
-class _Teacher:
+class _Trainer:
     """The steps of one fit: everything but its state."""
 
     def __init__(self, told, data, judged):
@@ -248,7 +248,7 @@ class _Teacher:
             )  # fmt: skip
 
     def start(self):
-        free = taken(self.told.params, self.told.names)
+        free = free_vector(self.told.params, self.told.names)
         return _State(0, free, self.adam.init(jnp.asarray(free)), (), ())
 
     def advance(self, state):
@@ -270,7 +270,7 @@ class _Teacher:
         )
         if self.judged is not None and (state.step % told.every == 0 or state.step == told.steps):
             state = self.judge(state)
-        named = plain(told.params, told.names, free)
+        named = to_params(told.params, told.names, free)
         record = {"loss": -value, "gradient_norm": norm,
                   "params": {n: getattr(named, n) for n in told.names}}  # fmt: skip
         return state, record
@@ -309,7 +309,7 @@ class _Teacher:
     def judge(self, state):
         """The state with the tail's mean judged on the held-out logs; `stopped` if that was it."""
         told, free = self.told, self.tail(state)
-        found = evidence(self.judged, told.config, plain(told.params, told.names, free),
+        found = evidence(self.judged, told.config, to_params(told.params, told.names, free),
                          told.held_out_seeds, (told.seed + 1) * 100_003 + state.step)  # fmt: skip
         error = float(np.std(found) / np.sqrt(len(found)))
         judgements = (*state.judgements, (state.step, float(found.mean()), error, free))

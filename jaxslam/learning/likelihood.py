@@ -26,7 +26,7 @@ from jaxslam.config import Params
 from jaxslam.filter import blocks, resampling
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.association import CLUTTER, NEW
-from jaxslam.filter.frames import frames
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.odometry import Odometry
 from jaxslam.models import motion
 from jaxslam.models.sensors import Measurements
@@ -80,13 +80,15 @@ def learnable(config):
     return tuple(name for name in names if config.clutter or name != "outlier")
 
 
-def data_of(log, config, params=None, steps=None):
+def data_from_log(log, config, params=None, steps=None):
     """`Data` of a `Log`; `steps`: filled up with so many frames of nothing (None: not).
 
     Places are shifted so that the start is near the origin; float32 has 7 digits. Raises
     `ValueError` when the log can't supply what the configuration asks or has more steps.
     """
-    made = frames(log, config.sensor, config.measurements, params, config.association == "known")
+    made = frames_from_log(
+        log, config.sensor, config.measurements, params, config.association == "known"
+    )
     total = len(made.time)
     steps = total if steps is None else steps
     if steps < total:
@@ -111,7 +113,7 @@ def log_likelihood(params, log, key, config, estimator="fisher", discount=DISCOU
     landmarks as there were (`frame_terms`). Raises `ValueError` for an estimator that is not there.
     """
     check(config, estimator)
-    data = log if isinstance(log, Data) else data_of(log, config)
+    data = log if isinstance(log, Data) else data_from_log(log, config)
     numbers = Params(*(jnp.asarray(value, data.start_pose.dtype) for value in params))
     discount = jnp.asarray(discount, data.start_pose.dtype)
     return _differentiable(config, estimator, numbers, discount, data, key)
@@ -127,9 +129,9 @@ def score(params, log, key, config, names, estimator="fisher", discount=DISCOUNT
     Raises `ValueError` for names that have no derivative.
     """
     check(config, estimator, names)
-    data = log if isinstance(log, Data) else data_of(log, config)
+    data = log if isinstance(log, Data) else data_from_log(log, config)
     numbers = Params(*(jnp.asarray(value, data.start_pose.dtype) for value in params))
-    return scored(numbers, data, key, config, tuple(names), estimator, discount)
+    return score_and_value(numbers, data, key, config, tuple(names), estimator, discount)
 
 
 def check(config, estimator="fisher", names=()):
@@ -160,7 +162,7 @@ def _derivative(config, estimator, primals, tangents):
         if not isinstance(tangent, jax.custom_derivatives.SymbolicZero)
     ]
     names = tuple(name for name in learnable(config) if name in moved)
-    found = scored(params, data, key, config, names, estimator, discount)
+    found = score_and_value(params, data, key, config, names, estimator, discount)
     along = [getattr(tangents[0], name) * found.total[i] for i, name in enumerate(names)]
     return found.log_likelihood, sum(along, jnp.zeros_like(found.log_likelihood))
 
@@ -173,24 +175,24 @@ def value(params, data, key, config):
     """The estimate of the log likelihood alone."""
     config = dataclasses.replace(config, lazy=False)
     start, key = jax.random.split(key)
-    state = _begin(data, start, config)
+    state = _initial_state(data, start, config)
 
     def step(state, frame):
-        chance = draws(key, state.step, config)
+        chance = draw_for_frame(key, state.step, config)
         state, info = fastslam.advance(chance, state, *frame, params, config)
         return state, info.log_evidence + frame_terms(frame[1], params)
 
     return jax.lax.scan(step, state, (data.odometry, data.measurements))[1].sum()
 
 
-def _begin(data, key, config):
+def _initial_state(data, key, config):
     """`filter.State` before the first frame."""
     return fastslam.init(config, key, data.start_pose, data.start_cov, data.landmarks_given)
 
 
-def draws(key, step, config):
+def draw_for_frame(key, step, config):
     """`filter.draws`, and for `known` associations uniforms to draw between slot and clutter."""
-    chance = fastslam.draws(key, step, config)
+    chance = fastslam.draw_random_numbers(key, step, config)
     if config.association == "known" and config.clutter:
         shape = config.measurements, config.particles
         own = jax.random.fold_in(key, 2**30 + step)  # no step's key, nor any of its parts
@@ -228,14 +230,14 @@ class _Carry(NamedTuple):
 
 
 @partial(jax.jit, static_argnames=("config", "names", "estimator"))
-def scored(params, data, key, config, names, estimator="fisher", discount=DISCOUNT):
+def score_and_value(params, data, key, config, names, estimator="fisher", discount=DISCOUNT):
     """`score` of `Data`, unchecked, for use inside other compiled programs."""
     frozen = estimator == "fisher"
     # Derivatives are resampled along with the landmarks; where these lie makes no difference.
     config = dataclasses.replace(config, lazy=False)
     start, key = jax.random.split(key)
-    state = _begin(data, start, config)
-    through = _through(names, config, data.measurements, frozen)
+    state = _initial_state(data, start, config)
+    through = _filter_through(names, config, data.measurements, frozen)
     zero = jnp.zeros((len(through), *state.pose.shape), state.pose.dtype)
     carry = _Carry(
         state,
@@ -260,7 +262,7 @@ def scored(params, data, key, config, names, estimator="fisher", discount=DISCOU
     return Score(total, log_evidence.sum(), steps, log_evidence, last.ess)
 
 
-def _through(names, config, measurements, frozen):
+def _filter_through(names, config, measurements, frozen):
     """Those of the names whose derivatives go through poses or landmarks."""
     if not frozen:
         return names
@@ -282,7 +284,7 @@ def _step(carry, frame, params, key, config, names, through, estimator, discount
     """A filter step that takes the derivatives along."""
     frozen = estimator == "fisher"
     state, (odometry, measurements) = carry.state, frame
-    chance = draws(key, state.step, config)
+    chance = draw_for_frame(key, state.step, config)
     seen, pose_dot, world_dot, by_density = _look(
         carry, chance, frame, params, config, through, frozen
     )

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from jaxslam.config import UNITS
-from jaxslam.files import replacing
+from jaxslam.files import atomic_write
 from jaxslam.learning.likelihood import BIASED, DISCOUNT
 from jaxslam.learning.transforms import TRANSFORM, from_free
 from jaxslam.learning.uncertainty import MANY
@@ -56,7 +56,7 @@ def standard_errors(errors):
     return {name: float(error) for name, error, free in told if free < KNOWN}
 
 
-def sentences(fit, errors, judged=None):
+def describe(fit, errors, judged=None):
     """Lines of text: why it ended, held-out evidence, how far the particles are to be trusted."""
     lines = [f"{fit.stopped} ({fit.steps} steps, {fit.seconds:.0f} s)"]
     if judged is not None:
@@ -71,7 +71,7 @@ def sentences(fit, errors, judged=None):
     lines.append(f"log Z of one log spreads by {errors.log_z_sd:.2f} nats over seeds")
     for discount in sorted(errors.discounts):
         if discount != DISCOUNT:
-            name, far = moved(errors, discount)
+            name, far = movement(errors, discount)
             lines.append(
                 f"discount {discount:g} instead of {DISCOUNT:g} would move the estimate by "
                 f"{far:.2g} standard errors at most ({name})"
@@ -79,7 +79,7 @@ def sentences(fit, errors, judged=None):
     return [*lines, *errors.unresolved]
 
 
-def moved(errors, discount):
+def movement(errors, discount):
     """Which parameter the score with another discount would move most, and by how many standard
     errors: a Newton step from where the two scores differ."""
     change = errors.discounts[discount] - errors.discounts[DISCOUNT]
@@ -133,7 +133,7 @@ def save_csv(path, fit):
     head = ("step", "loss", "gradient_norm", "rate", *fit.names, "held_out", "held_out_error")
     rows.writerow(head)
     free = np.reshape(told.free, (-1, len(fit.names)))
-    values = np.column_stack([values_of(n, free[:, i]) for i, n in enumerate(fit.names)])
+    values = np.column_stack([estimates(n, free[:, i]) for i, n in enumerate(fit.names)])
     for s, at in enumerate(values):
         judged = ("", "")
         if s + 1 in held:
@@ -141,11 +141,11 @@ def save_csv(path, fit):
             judged = repr(float(told.held_out[i])), repr(float(told.held_out_error[i]))
         numbers = (-told.log_likelihood[s], told.gradient_norm[s], told.rate[s], *at)
         rows.writerow([s + 1, *(f"{float(number):.9g}" for number in numbers), *judged])
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         file.write(text.getvalue().encode())
 
 
-def values_of(name, free):
+def estimates(name, free):
     """A parameter's values for free ones, as NumPy has them."""
     return np.asarray(from_free(name, np.asarray(free)), float)
 
@@ -181,9 +181,9 @@ def save_figure(figure, path):
 
 
 def _draw_parameter(axes, fit, errors, i, name):
-    path = values_of(name, fit.history.free[:, i])
+    path = estimates(name, fit.history.free[:, i])
     at, error = fit.free[i], np.fmin(errors.free_error[i], KNOWN)
-    low, middle, high = values_of(name, np.array([at - error, at, at + error]))
+    low, middle, high = estimates(name, np.array([at - error, at, at + error]))
     axes.plot(np.arange(len(path)), path, color=FILTER, lw=1.2, label="iterates")
     axes.plot(0, path[0], "o", color=RECKONING, ms=5, label="start", clip_on=False, zorder=5)
     axes.axhline(middle, color=LANDMARK, lw=1.2, label="estimate")

@@ -14,7 +14,7 @@ from jaxslam.config import UNITS, Params
 from jaxslam.filter import sharding
 from jaxslam.learning import fit as learn
 from jaxslam.learning import likelihood, transforms
-from jaxslam.learning.report import KNOWN, fit_axis, values_of
+from jaxslam.learning.report import KNOWN, estimates, fit_axis
 from jaxslam.plotting import LANDMARK, RECKONING, STYLE, ellipses
 
 CELLS = 9
@@ -41,7 +41,7 @@ def surface(logs, fit, errors, pair, seeds=2, seed=0, progress=None):
     The same random numbers everywhere: neighbours then differ by less than seeds do. `progress`:
     called with (columns done, columns).
     """
-    data = learn.stacked(logs, fit.config, fit.params)
+    data = learn.stack_logs(logs, fit.config, fit.params)
     dtype = data.start_pose.dtype
     count = len(data.start_pose)
     numbers = Params(*(jnp.asarray(value, dtype) for value in fit.params))
@@ -80,15 +80,15 @@ def _values(free, params, data, which, keys, config, names):
     def one(item):
         at, log, key = item
         mine = jax.tree.map(lambda leaf: leaf[log], data)
-        return likelihood.value(transforms.put(params, names, at), mine, key, config)
+        return likelihood.value(transforms.with_free(params, names, at), mine, key, config)
 
-    return sharding.spread(one, (free, which, keys), len(jax.devices()))
+    return sharding.map_over_devices(one, (free, which, keys), len(jax.devices()))
 
 
 def draw_surface(found, fit, errors):
     """Figure of a `Surface`: nats below its top, the fit's path, the 1-sigma ellipse."""
     where = [fit.names.index(name) for name in found.names]
-    x, y = (values_of(n, f) for n, f in zip(found.names, (found.first, found.second), strict=True))
+    x, y = (estimates(n, f) for n, f in zip(found.names, (found.first, found.second), strict=True))
     below = found.log_likelihood.T - np.nanmax(found.log_likelihood)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.4, 5.2), layout="constrained")
@@ -114,7 +114,7 @@ def _draw_path(axes, found, fit, errors, where):
     """Iterates, start, estimate and ellipse."""
 
     def own(free):
-        return [values_of(n, free[..., k]) for k, n in enumerate(found.names)]
+        return [estimates(n, free[..., k]) for k, n in enumerate(found.names)]
 
     lined = [withStroke(linewidth=2.6, foreground="white")]
     path, at = fit.history.free[:, where], fit.free[where]

@@ -34,19 +34,19 @@ def from_free(name, free):
     return jnp.exp(free) if kind == "log" else free
 
 
-def put(params, names, free):
+def with_free(params, names, free):
     """`params` with the values that `free` [P] stands for."""
     return params._replace(**{n: from_free(n, free[i]) for i, n in enumerate(names)})
 
 
-def plain(params, names, free):
+def to_params(params, names, free):
     """`put` with floats, worked out in double precision."""
     with jax.enable_x64(True):
         found = {n: float(from_free(n, float(free[i]))) for i, n in enumerate(names)}
     return params._replace(**found)
 
 
-def taken(params, names):
+def free_vector(params, names):
     """The free values [P] (float64) of the parameters `names`.
 
     Raises `ValueError` for a value that has none, such as a noise of zero.
@@ -59,7 +59,7 @@ def taken(params, names):
         return np.array([float(to_free(n, float(getattr(params, n)))) for n in names])
 
 
-def slope_at(name, free):
+def derivative_at(name, free):
     """Units of a parameter per unit of the free scale."""
     with jax.enable_x64(True):
         return float(jax.grad(lambda f: from_free(name, f))(float(free)))

@@ -17,7 +17,7 @@ import numpy as np
 from jaxslam.config import Params
 from jaxslam.learning import fit as learn
 from jaxslam.learning import likelihood
-from jaxslam.learning.transforms import plain, slope_at
+from jaxslam.learning.transforms import derivative_at, to_params
 
 OPEN = 1.0  # free scale: a standard deviation from which on a direction is unresolved
 FAINT = 3.0  # free scale: nobody knows less of a parameter than this standard deviation
@@ -69,8 +69,8 @@ class Uncertainty(NamedTuple):
 def assess(fit, logs, seeds=8, seed=1, discounts=(0.9, likelihood.DISCOUNT, 1.0)):
     """`Uncertainty` of a `learn.Fit` to these logs: 2 P + 3 times `seeds` filter runs of each."""
     names, config = fit.names, fit.config
-    data = learn.stacked(logs, config, fit.params)
-    look = _Look(fit.params, data, config, names, seeds, seed)
+    data = learn.stack_logs(logs, config, fit.params)
+    look = _ScoreAt(fit.params, data, config, names, seeds, seed)
     found = look(fit.free)
     outer = outer_products(found.steps)
     widths = half_widths(outer)
@@ -78,18 +78,18 @@ def assess(fit, logs, seeds=8, seed=1, discounts=(0.9, likelihood.DISCOUNT, 1.0)
         np.array([look(fit.free + way).total.sum(0) for way in sign * np.diag(widths)])
         for sign in (-1, 1)
     )
-    curvature, noise = curved(low, high, widths)
+    curvature, noise = curvature_at(low, high, widths)
     by_seed = found.total.sum(0)
-    covariance, agreement, made = combined(outer, curvature, noise)
-    inverse = inverted(outer if made == "outer" else (outer + curvature) / 2)
+    covariance, agreement, made = combine_covariances(outer, curvature, noise)
+    inverse = invert(outer if made == "outer" else (outer + curvature) / 2)
     free_error = np.sqrt(np.diag(covariance))
     spread = np.cov(by_seed.T).reshape(outer.shape) / seeds
-    slope = np.array([slope_at(n, f) for n, f in zip(names, fit.free, strict=True)])
+    slope = np.array([derivative_at(n, f) for n, f in zip(names, fit.free, strict=True)])
     told = {d: (found if d == likelihood.DISCOUNT else look(fit.free, d)).total.sum(0).mean(0)
             for d in discounts}  # fmt: skip
     # Where the slope is lost in noise, that the two differ tells nothing.
     differ = agreement if made == "sandwich" else np.ones(len(names))
-    verdict, sentences = judged(names, covariance, differ)
+    verdict, sentences = judge(names, covariance, differ)
     return Uncertainty(
         names=names,
         free=fit.free,
@@ -101,7 +101,7 @@ def assess(fit, logs, seeds=8, seed=1, discounts=(0.9, likelihood.DISCOUNT, 1.0)
         curvature=curvature,
         agreement=agreement,
         made=made,
-        step=newton(outer if made == "outer" else (outer + curvature) / 2, by_seed.mean(0)),
+        step=newton_step(outer if made == "outer" else (outer + curvature) / 2, by_seed.mean(0)),
         log_z_sd=float(found.log_likelihood.std(1, ddof=1).mean()),
         discounts=told,
         verdict=verdict,
@@ -109,15 +109,15 @@ def assess(fit, logs, seeds=8, seed=1, discounts=(0.9, likelihood.DISCOUNT, 1.0)
     )
 
 
-def improved(fit, errors):
+def improve(fit, errors):
     """The `learn.Fit` after the Newton step that `assess` found: Adam's last iterates still swing
     about the root (experiments/recovery.py, bearings alone: RMS z 1.60 before such steps, 1.10
     after)."""
     free = fit.free + errors.step
-    return fit._replace(free=free, params=plain(fit.params, fit.names, free))
+    return fit._replace(free=free, params=to_params(fit.params, fit.names, free))
 
 
-class _Look:
+class _ScoreAt:
     """Scores of all logs and seeds, always the same seeds."""
 
     def __init__(self, params, data, config, names, seeds, seed):
@@ -145,7 +145,7 @@ def outer_products(steps):
     return (both - same) / (seeds * (seeds - 1))
 
 
-def curved(low, high, widths):
+def curvature_at(low, high, widths):
     """Minus the slope of the mean score [P, P], and its standard error, by finite differences.
 
     `low`, `high` [P, seeds, P]: scores below and above in every parameter, with the same seeds;
@@ -161,21 +161,21 @@ def half_widths(outer):
 
     Less would be lost in the scores' noise, more in their curvature.
     """
-    return np.clip(0.5 * np.sqrt(np.diag(inverted(outer))), 1e-3, 0.25)
+    return np.clip(0.5 * np.sqrt(np.diag(invert(outer))), 1e-3, 0.25)
 
 
-def newton(information, score):
+def newton_step(information, score):
     """A Newton step [P] towards the score's root; in each parameter it goes two standard errors or
     `STRIDE` at most.
 
     Adam ends within about one standard error; this takes most of it away.
     """
-    inverse = inverted(information)
+    inverse = invert(information)
     most = np.minimum(2 * np.sqrt(np.diag(inverse)), STRIDE)
     return np.clip(inverse @ score, -most, most)
 
 
-def combined(outer, curvature, noise):
+def combine_covariances(outer, curvature, noise):
     """Covariance [P, P] of the estimate, the ratio [P] of the two standard errors, and how made.
 
     `both`; `outer`, where the slope is lost in the noise of few seeds; or `sandwich`, where they
@@ -184,7 +184,7 @@ def combined(outer, curvature, noise):
     `noise` [P, P]: standard errors of `curvature`. All are measured by the outer products: unity in
     every direction is agreement.
     """
-    first, second = inverted(outer), inverted(curvature)
+    first, second = invert(outer), invert(curvature)
     agreement = np.sqrt(np.diag(first) / np.diag(second))
     root = np.linalg.cholesky(first)
     apart = np.linalg.norm(root.T @ (curvature - outer) @ root)
@@ -194,10 +194,10 @@ def combined(outer, curvature, noise):
         return second @ (_positive(outer) + _faint(outer)) @ second, agreement, "sandwich"
     if lost > DIFFER:
         return first, agreement, "outer"
-    return inverted((outer + curvature) / 2), agreement, "both"
+    return invert((outer + curvature) / 2), agreement, "both"
 
 
-def inverted(information):
+def invert(information):
     """Inverse of an information, with a faint prior for what nothing is known of."""
     return np.linalg.inv(_positive(information) + _faint(information))
 
@@ -212,7 +212,7 @@ def _positive(matrix):
     return (vectors * np.maximum(values, 0)) @ vectors.T
 
 
-def judged(names, covariance, agreement):
+def judge(names, covariance, agreement):
     """Verdict [P] on every parameter, and sentences on the combinations left open."""
     errors = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance)

@@ -25,7 +25,7 @@ BEYOND = 4.0  # standard deviations of a column: what is farther off tells no mo
 VARIED = 1e-5  # variance of a direction relative to the largest: less is rounding
 
 
-class Space(NamedTuple):
+class AppearanceSpace(NamedTuple):
     """Where descriptors are compared: `coordinates` [n, J] of all rows, normal scores; and `within`
     [J], the variance of one landmark's that is reckoned with."""
 
@@ -33,12 +33,12 @@ class Space(NamedTuple):
     within: np.ndarray
 
 
-def space(log):
+def fit_appearance_space(log):
     """`Space` of a log's descriptors; without coordinates where they tell nothing."""
-    nothing = Space(np.zeros((len(log.frame), 0)), np.zeros(0))
+    nothing = AppearanceSpace(np.zeros((len(log.frame), 0)), np.zeros(0))
     if log.descriptor is None or len(log.frame) == 0:
         return nothing
-    x = _scaled(log.descriptor.astype(float))
+    x = _rescale(log.descriptor.astype(float))
     track = _tracks(log)
     inside = track >= 0
     freedom = inside.sum() - len(np.unique(track[inside]))
@@ -62,10 +62,12 @@ def space(log):
     value = np.diag(_within(scores, track)) / np.maximum(scores.var(0), VARIED)
     good = value < USEFUL
     # Links last a few frames, in which light and background change less than over a log.
-    return Space(coordinates[:, good], np.round(np.sqrt(np.maximum(value[good], 1e-4)), 4))
+    return AppearanceSpace(
+        coordinates[:, good], np.round(np.sqrt(np.maximum(value[good], 1e-4)), 4)
+    )
 
 
-def _scaled(x):
+def _rescale(x):
     """Columns [n, D] of about unit variance, without those that are constant; few rows far off
     decide nothing."""
     x = x[:, x.std(0) > 1e-6 * np.abs(x).max(0)]

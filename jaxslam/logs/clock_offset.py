@@ -22,7 +22,7 @@ ENOUGH = 300_000  # differences of bearings; of more, only every so many frames 
 TURNED = 1.0  # rad turned in each of them
 
 
-class Offset(NamedTuple):
+class ClockOffset(NamedTuple):
     """Seconds by which frames are to be moved; the `least` and `most` of parts of the log."""
 
     seconds: float
@@ -30,7 +30,7 @@ class Offset(NamedTuple):
     most: float
 
 
-def offset(log):
+def estimate_clock_offset(log):
     """`Offset` of a log's frames against its odometry; None where it can't be told: no velocities,
     too few bearings or turns, or the parts of the log do not agree."""
     if log.odometry_kind != "velocity" or log.bearing is None or len(log.frame) == 0:
@@ -44,10 +44,10 @@ def offset(log):
     least, middle, most = np.min(found), np.median(found), np.max(found)
     if max(abs(least), abs(most)) > MOST - COARSE or most - least > max(0.1, abs(middle)):
         return None
-    return Offset(float(middle), float(least), float(most))
+    return ClockOffset(float(middle), float(least), float(most))
 
 
-def moved(log, seconds):
+def shift_frames(log, seconds):
     """The log with its frames' stamps moved by so many seconds."""
     if not abs(seconds) < 1e6:
         raise ValueError(f"time offset {seconds} s; must be a number of seconds")

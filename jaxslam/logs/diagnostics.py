@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.logs import clock_offset
-from jaxslam.logs.appearance_space import space
+from jaxslam.logs.appearance_space import fit_appearance_space
 from jaxslam.logs.log import NOT_USED
 
 MOST_SPEED = 5.0  # m/s
@@ -118,7 +118,7 @@ def _time(log):
 
 
 def _clocks(log):
-    found = clock_offset.offset(log)
+    found = clock_offset.estimate_clock_offset(log)
     if found is not None:
         text = f"best as stamped ({found.least:.2f} to {found.most:.2f} s by parts of the log)"
         if abs(found.seconds) > SAME_CLOCK_S:
@@ -175,7 +175,7 @@ def _identities(log):
 
 def _looks(log):
     if log.descriptor is not None and len(log.frame):
-        found = len(space(log).within)
+        found = len(fit_appearance_space(log).within)
         text = f"descriptors of {log.descriptor.shape[1]} columns: "
         told = f"{found} coordinates tell landmarks apart" if found else "tell no landmarks apart"
         yield Finding("ok", text + told)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from jaxslam.config import Params
-from jaxslam.logs.validation import assign, check_rows, check_stamps, checked, checked_number
+from jaxslam.logs.validation import assign, check_array, check_number, check_rows, check_stamps
 
 # Rows by design not for the filter (another robot seen) are counted under reasons that start so.
 NOT_USED = "not used: "
@@ -36,23 +36,25 @@ class Truth:
     resolution: float = 0.0
 
     def __post_init__(self):
-        assign(self, "time", checked("truth.time", self.time, np.int64, (None,)))
+        assign(self, "time", check_array("truth.time", self.time, np.int64, (None,)))
         poses = None if self.time is None else len(self.time)
-        assign(self, "pose", checked("truth.pose", self.pose, np.float64, (poses, 3)))
+        assign(self, "pose", check_array("truth.pose", self.pose, np.float64, (poses, 3)))
         if (self.time is None) != (self.pose is None):
             raise ValueError("truth: time and pose must be given together")
         if self.time is not None:
             check_stamps("truth.time", self.time)
-        assign(self, "landmarks", checked("truth.landmarks", self.landmarks, np.float64, (None, 2)))
+        assign(
+            self, "landmarks", check_array("truth.landmarks", self.landmarks, np.float64, (None, 2))
+        )
         count = 0 if self.landmarks is None else len(self.landmarks)
-        ids = checked("truth.landmark_id", self.landmark_id, np.int64, (count,))
+        ids = check_array("truth.landmark_id", self.landmark_id, np.int64, (count,))
         if ids is not None and len(np.unique(ids)) != len(ids):
             raise ValueError("truth.landmark_id: the same id stands for two landmarks")
         assign(self, "landmark_id", ids)
-        assign(self, "identity", checked("truth.identity", self.identity, np.int64, (None,)))
+        assign(self, "identity", check_array("truth.identity", self.identity, np.int64, (None,)))
         if self.identity is not None:
             check_rows("truth.identity", self.identity, self.identity >= -1, "must be -1 or more")
-        assign(self, "resolution", checked_number("truth.resolution", self.resolution, least=0))
+        assign(self, "resolution", check_number("truth.resolution", self.resolution, least=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +72,15 @@ class FloorPlan:
     def __post_init__(self):
         if self.segments is None and self.image is None:
             raise ValueError("plan: has neither segments nor an image")
-        assign(self, "segments", checked("plan.segments", self.segments, np.float64, (None, 4)))
-        assign(self, "image", checked("plan.image", self.image, np.uint8, (None, None)))
-        assign(self, "scale", checked_number("plan.scale", self.scale))
+        assign(self, "segments", check_array("plan.segments", self.segments, np.float64, (None, 4)))
+        assign(self, "image", check_array("plan.image", self.image, np.uint8, (None, None)))
+        assign(self, "scale", check_number("plan.scale", self.scale))
         if self.scale <= 0:
             raise ValueError(f"plan.scale: {self.scale} m per pixel; must be above 0")
         assign(
-            self, "origin", tuple(checked("plan.origin", self.origin, np.float64, (2,)).tolist())
+            self,
+            "origin",
+            tuple(check_array("plan.origin", self.origin, np.float64, (2,)).tolist()),
         )
 
 
@@ -132,9 +136,9 @@ class Log:
         _check_sensor(self)
         _check_start(self)
         if self.truth is not None and self.truth.identity is not None:
-            checked("truth.identity", self.truth.identity, np.int64, (len(self.frame),))
+            check_array("truth.identity", self.truth.identity, np.int64, (len(self.frame),))
         skipped = {
-            str(k): checked_number(f"skipped/{k}", v, least=0) for k, v in self.skipped.items()
+            str(k): check_number(f"skipped/{k}", v, least=0) for k, v in self.skipped.items()
         }
         assign(self, "skipped", {reason: int(count) for reason, count in skipped.items()})
 
@@ -161,21 +165,21 @@ class Log:
 def _check_odometry(log):
     if log.odometry_kind not in KINDS:
         raise ValueError(f"odometry_kind: {log.odometry_kind!r} is not one of {', '.join(KINDS)}")
-    assign(log, "odometry_time", checked("odometry_time", log.odometry_time, np.int64, (None,)))
+    assign(log, "odometry_time", check_array("odometry_time", log.odometry_time, np.int64, (None,)))
     rows = len(log.odometry_time)
     if rows == 0:
         raise ValueError("odometry_time: the log has no odometry")
     check_stamps("odometry_time", log.odometry_time)
-    assign(log, "odometry", checked("odometry", log.odometry, np.float64, (rows, 2)))
+    assign(log, "odometry", check_array("odometry", log.odometry, np.float64, (rows, 2)))
 
 
 def _check_measurements(log):
-    assign(log, "frame_time", checked("frame_time", log.frame_time, np.int64, (None,)))
+    assign(log, "frame_time", check_array("frame_time", log.frame_time, np.int64, (None,)))
     frames = len(log.frame_time)
     if frames == 0:
         raise ValueError("frame_time: the log has no frames")
     check_stamps("frame_time", log.frame_time)
-    frame = checked("frame", log.frame, np.int64, (None,))
+    frame = check_array("frame", log.frame, np.int64, (None,))
     assign(log, "frame", frame)
     check_rows("frame", frame, (frame >= 0) & (frame < frames), f"must be in 0..{frames - 1}")
     check_rows("frame", frame, np.diff(frame, prepend=frame[:1]) >= 0, "must not decrease")
@@ -191,7 +195,7 @@ def _check_measurements(log):
         ("descriptor", np.float32, (n, None)),
     ):
         gaps = name.startswith("point")
-        assign(log, name, checked(name, getattr(log, name), dtype, shape, gaps))
+        assign(log, name, check_array(name, getattr(log, name), dtype, shape, gaps))
     if log.bearing is None and log.point is None:
         raise ValueError("bearing: the log has neither bearings nor points")
     for name, needs in (
@@ -234,24 +238,24 @@ def _check_points(log):
 
 
 def _check_sensor(log):
-    least, largest, reach = checked("view", log.view, np.float64, (3,)).tolist()
+    least, largest, reach = check_array("view", log.view, np.float64, (3,)).tolist()
     # The filter compares with bearings in [-pi, pi); turn the mounting, not the view.
     if not -math.pi - 1e-9 <= least < largest <= math.pi + 1e-9 or reach <= 0:
         rule = "must be least and largest bearing within -pi..pi rad, and a range above 0 m"
         raise ValueError(f"view: {(least, largest, reach)} {rule}")
     assign(log, "view", (least, largest, reach))
-    assign(log, "mounting", tuple(checked("mounting", log.mounting, np.float64, (3,)).tolist()))
-    assign(log, "time_offset", checked_number("time_offset", log.time_offset))
+    assign(log, "mounting", tuple(check_array("mounting", log.mounting, np.float64, (3,)).tolist()))
+    assign(log, "time_offset", check_number("time_offset", log.time_offset))
     for name in log.noise:
         if name not in Params._fields:
             allowed = ", ".join(Params._fields)
             raise ValueError(f"noise/{name}: no such parameter; allowed: {allowed}")
-    assign(log, "noise", {k: checked_number(f"noise/{k}", v) for k, v in log.noise.items()})
+    assign(log, "noise", {k: check_number(f"noise/{k}", v) for k, v in log.noise.items()})
 
 
 def _check_start(log):
-    assign(log, "start_pose", checked("start_pose", log.start_pose, np.float64, (3,)))
-    cov = checked("start_cov", log.start_cov, np.float64, (3, 3))
+    assign(log, "start_pose", check_array("start_pose", log.start_pose, np.float64, (3,)))
+    cov = check_array("start_cov", log.start_cov, np.float64, (3, 3))
     size = max(np.abs(cov).max(), 1e-300)
     if np.abs(cov - cov.T).max() > 1e-9 * size or np.linalg.eigvalsh(cov)[0] < -1e-9 * size:
         raise ValueError("start_cov: is not a covariance (symmetric, no negative variance)")

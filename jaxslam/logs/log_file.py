@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxslam.files import replacing
+from jaxslam.files import atomic_write
 from jaxslam.logs.log import FloorPlan, Log, Truth
 
 SCHEMA = 1
@@ -27,8 +27,8 @@ def save_log(path, log):
     path = Path(path)
     if path.suffix != ".npz":
         raise ValueError(f"{path}: a log is a .npz file; name it {path.name}.npz")
-    with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
-        for name, array in entries(log).items():
+    with atomic_write(path) as file, zipfile.ZipFile(file, "w") as archive:
+        for name, array in entries_of(log).items():
             # A fixed date: the same log makes the same bytes.
             entry = zipfile.ZipInfo(name + ".npy", (1980, 1, 1, 0, 0, 0))
             entry.compress_type = zipfile.ZIP_DEFLATED
@@ -36,7 +36,7 @@ def save_log(path, log):
                 np.lib.format.write_array(member, array, allow_pickle=False)
 
 
-def entries(log):
+def entries_of(log):
     """The file's entries, by name."""
     entries = {"schema": np.int64(SCHEMA)}
     for part, prefix in ((log, ""), (log.truth, "truth/"), (log.plan, "plan/")):

@@ -15,7 +15,7 @@ def assign(owner, name, value):
     object.__setattr__(owner, name, value)
 
 
-def checked(where, value, dtype, shape, gaps=False):
+def check_array(where, value, dtype, shape, gaps=False):
     """`value` as a read-only array, or None; `shape` lists lengths, None where any is allowed.
 
     `gaps`: a row may be NaN altogether.
@@ -60,7 +60,7 @@ def check_stamps(where, time):
     check_rows(where, time, step > 0, "repeats or precedes the stamp before it")
 
 
-def checked_number(where, value, least=-math.inf):
+def check_number(where, value, least=-math.inf):
     """`value` as a float; raise for what is no number, not finite or below `least`."""
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     if not number or not math.isfinite(value) or value < least:

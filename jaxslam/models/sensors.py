@@ -44,7 +44,7 @@ class Measurements(NamedTuple):
     within: jax.Array | None = None
 
 
-class Seen(NamedTuple):
+class Prediction(NamedTuple):
     """Prediction of one landmark: its measurement, rows of the Jacobian, noise, where it is.
 
     `stretch`: for `bearing`, the derivative by the landmark of the logarithm of `ray`'s length.
@@ -60,7 +60,7 @@ class Seen(NamedTuple):
     stretch: tuple = ()
 
 
-def rescaled(measurements, params):
+def apply_position_scale(measurements, params):
     """The measurements with positions that rest on odometry in true metres: times `gain_tran`.
 
     A triangle over a distance d is as much too small as d is. The covariances stay: the gain is
@@ -72,7 +72,7 @@ def rescaled(measurements, params):
     return measurements._replace(value=measurements.value * gain[:, None])
 
 
-def correlated(params, odometry):
+def correlated_noise(params, odometry):
     """`Params` whose measurement noise is that of one independent measurement per correlation.
 
     Errors that follow a first-order autoregression in the travelled path d have correlation
@@ -90,7 +90,7 @@ def correlated(params, odometry):
     return params._replace(**{name: getattr(params, name) * root for name in names})
 
 
-def pose_of(pose, params):
+def sensor_pose_of(pose, params):
     """The sensor's pose from the robot's."""
     return geometry.compose(pose, (params.mount_x, params.mount_y, params.mount_yaw))
 
@@ -118,7 +118,7 @@ def along_ray(point, by_direction, by_depth, depth, heading, params):
     stretch = ((dx * tx + dy * ty) * scale, (dx * ax + dy * ay) * scale)
     r = q / jnp.maximum(depth, LEAST_INVERSE_DEPTH)
     variance = params.sigma_bearing**2 + (params.growth * depth / q) ** 2
-    return Seen((bearing,), (row,), (variance,), r, bearing, stretch)
+    return Prediction((bearing,), (row,), (variance,), r, bearing, stretch)
 
 
 def observe(sensor, sensor_pose, mean, anchor, params):
@@ -131,12 +131,12 @@ def observe(sensor, sensor_pose, mean, anchor, params):
     bearing = wrap(direction(dy, dx) - heading)
     if sensor == "position":
         c, s = jnp.cos(heading), jnp.sin(heading)
-        return Seen((c * dx + s * dy, c * dy - s * dx), ((c, s), (-s, c)), (), r, bearing)
+        return Prediction((c * dx + s * dy, c * dy - s * dx), ((c, s), (-s, c)), (), r, bearing)
     inverse = 1 / r  # one division: XLA repeats this for everything that is worked out from it
     c, s = dx * inverse, dy * inverse
     rows = ((c, s), (-s * inverse, c * inverse))
     noise = (params.sigma_range**2, bearing_variance(r, params))
-    return Seen((r, bearing), rows, noise, r, bearing)
+    return Prediction((r, bearing), rows, noise, r, bearing)
 
 
 def locate(sensor, sensor_pose, value, cov, params):
@@ -177,7 +177,7 @@ def log_new_density(sensor, value, params):
     return jnp.log1p(-params.outlier) + jnp.log(params.density_new * area)
 
 
-def at_most_one_new(params):
+def cap_new_density(params):
     """The parameters for telling hidden identities apart by bearings alone: no more than one new
     landmark a frame is expected.
 

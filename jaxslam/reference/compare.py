@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxslam.config import Params, default_params
 from jaxslam.filter import step as fastslam
-from jaxslam.filter.frames import frames
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.truth import truth_at, wrap
 from jaxslam.models import geometry
 from jaxslam.reference import ekf
@@ -79,7 +79,7 @@ def compare(log, config, params=None, seed=0, steps=200, every=None, progress=No
     the prior and takes no notice of looks, so the filter does as it does.
     """
     config = dataclasses.replace(config, proposal="prior", rejuvenate=0.0, descriptors=0)
-    log = select(log, thinned(log, steps, every))
+    log = select_frames(log, thin(log, steps, every))
     double = agreement(log, config, params, seed, steps, True, progress)
     single = agreement(log, config, params, seed, steps, False, progress)
     true = truth_at(log.truth, log.frame_time)
@@ -87,7 +87,7 @@ def compare(log, config, params=None, seed=0, steps=200, every=None, progress=No
     return Comparison(double, single, *errors)
 
 
-def thinned(log, steps, every=None):
+def thin(log, steps, every=None):
     """Numbers of `steps` frames, every `every`-th from the first on (None: over a tenth)."""
     if every is None:
         every = max(1, len(log.frame_time) // (10 * steps))
@@ -108,8 +108,10 @@ def agreement(log, config, params=None, seed=0, steps=None, double=True, progres
     params = default_params(config.sensor, log) if params is None else params
     params = Params(*map(float, params))
     if steps is not None:
-        log = select(log, np.arange(min(steps, len(log.frame_time))))
-    data = frames(log, config.sensor, config.measurements, params, config.association == "known")
+        log = select_frames(log, np.arange(min(steps, len(log.frame_time))))
+    data = frames_from_log(
+        log, config.sensor, config.measurements, params, config.association == "known"
+    )
     if progress:
         progress(0, len(data.time))
     # The runner's local origin: float32 has 7 digits.
@@ -141,7 +143,7 @@ def agreement(log, config, params=None, seed=0, steps=None, double=True, progres
     )
 
 
-def select(log, kept):
+def select_frames(log, kept):
     """The log with only these frames (increasing numbers [F]): a slower sensor, the same drive."""
     number = np.full(len(log.frame_time), -1)
     number[kept] = np.arange(len(kept))
@@ -204,7 +206,7 @@ class _Trace(NamedTuple):
     pose: np.ndarray
     log_weight: np.ndarray
     ancestors: np.ndarray
-    birth: np.ndarray
+    landmark_id: np.ndarray
     mean: np.ndarray
 
 
@@ -212,7 +214,7 @@ class _Trace(NamedTuple):
 def _steps(key, state, odometry, measurements, params, config):
     def body(state, frame):
         state, info = fastslam.step(key, state, *frame, params, config)
-        kept = state.pose, state.log_weight, info.ancestors, info.birth, info.estimate.mean
+        kept = state.pose, state.log_weight, info.ancestors, info.landmark_id, info.estimate.mean
         return state, _Trace(*kept)
 
     return jax.lax.scan(body, state, (odometry, measurements))
@@ -229,11 +231,11 @@ def _run_filter(data, config, params, seed, start, log):
     jax.block_until_ready(steps(key, state, *given))  # to warm up
     begin, compiled = time.perf_counter(), compiled - begin
     final, trace = jax.block_until_ready(steps(key, state, *given))
-    final = fastslam.settled(final, config)
+    final = fastslam.settle(final, config)
     ran = time.perf_counter() - begin
     numbers = jnp.arange(len(data.time), dtype=jnp.int32)
-    chance = jax.vmap(lambda step: fastslam.draws(key, step, config))(numbers)
-    draws = fastslam.start_draws(key, config), chance.normals, chance.uniform
+    chance = jax.vmap(lambda step: fastslam.draw_random_numbers(key, step, config))(numbers)
+    draws = fastslam.draw_start(key, config), chance.normals, chance.uniform
     host = [jax.tree.map(np.asarray, tree) for tree in (final, trace, draws)]
     return *host, compiled, ran
 
@@ -257,7 +259,7 @@ def _baseline_map(reference, params, config, identities, origin):
 def _differences(state, trace, reference):
     """`same`, `pose`, `log_weight` and `landmarks` of `Agreement`."""
     equal = (trace.ancestors == reference.ancestors).all(1)
-    equal &= (np.swapaxes(trace.birth, 1, 2) == reference.birth).all((1, 2))
+    equal &= (np.swapaxes(trace.landmark_id, 1, 2) == reference.landmark_id).all((1, 2))
     total = len(equal)
     same = total if equal.all() else int(np.argmin(equal))
     if same == 0:
@@ -276,11 +278,11 @@ def _map_difference(world, particles):
     cov = np.stack(geometry.covariance(world.factor.astype(float)))
     largest = 0.0
     for i, particle in enumerate(particles):
-        marks = sorted((m for m in particle.landmarks if m is not None), key=lambda m: m.birth)
+        marks = sorted((m for m in particle.landmarks if m is not None), key=lambda m: m.landmark_id)
         slots = np.flatnonzero(world.count[:, i])
-        slots = slots[np.argsort(world.birth[slots, i])]
-        births = [(m.birth, m.count) for m in marks]
-        if births != list(zip(world.birth[slots, i], world.count[slots, i], strict=True)):
+        slots = slots[np.argsort(world.landmark_id[slots, i])]
+        births = [(m.landmark_id, m.count) for m in marks]
+        if births != list(zip(world.landmark_id[slots, i], world.count[slots, i], strict=True)):
             return np.inf
         for slot, landmark in zip(slots, marks, strict=True):
             (xx, xy), (_, yy) = landmark.cov

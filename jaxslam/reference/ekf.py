@@ -26,7 +26,7 @@ class Landmark:
     anchor: np.ndarray  # [2] world, m
     count: int  # times matched, the birth included
     log_odds: float  # of its existence
-    birth: int  # frame * K + measurement
+    landmark_id: int  # frame * K + measurement
 
 
 class Prediction(NamedTuple):
@@ -164,7 +164,7 @@ def merge(landmark, weights, parts):
     landmark.cov = within + between
 
 
-def create(measurement, s, birth, model):
+def create(measurement, s, landmark_id, model):
     """A landmark seen for the first time, from sensor pose s [3]."""
     if model.sensor == "bearing":
         mean = np.array([s[2] + measurement.value[0], model.inv_depth_mean])
@@ -178,7 +178,7 @@ def create(measurement, s, birth, model):
             jacobian = rotation(s[2] + b) @ np.diag([1.0, r])
         mean = s[:2] + rotation(s[2]) @ point
         cov = jacobian @ noise(r, measurement, model) @ jacobian.T
-    return Landmark(mean, cov, s[:2].copy(), 1, model.existence_new, birth)
+    return Landmark(mean, cov, s[:2].copy(), 1, model.existence_new, landmark_id)
 
 
 def point_of(landmark, sensor):

@@ -43,7 +43,7 @@ class BaselineResult(NamedTuple):
     degenerate: np.ndarray  # [T] no particle had a finite weight
     match: np.ndarray  # [T, N, K] slot, or -1 new, -2 clutter, -3 padding
     slot: np.ndarray  # [T, N, K] slot matched or created, -1 none
-    birth: np.ndarray  # [T, N, K] as match, but the landmark's birth instead of its slot
+    landmark_id: np.ndarray  # [T, N, K] as match, but the landmark's birth instead of its slot
     held: np.ndarray  # [T, M] slots that some particle used, before the step's resampling
     births: np.ndarray  # [T, N] landmarks created
     freed: np.ndarray  # [T, N] landmarks forgotten
@@ -196,7 +196,7 @@ def forget(particle, before, matched, s, model):
     return freed
 
 
-def dulled(model, o):
+def with_extra_noise(model, o):
     """The model for measurements whose errors live on over `correlation` metres of path, a radian
     of turning counting as a tenth of a metre.
 
@@ -231,11 +231,11 @@ def correct(particle, frame, columns, index, model, dull, held):
     else:
         choice = associate_likeliest(table, new, clutter, model.exclusive)
 
-    match, used, birth = [PADDING] * columns, [-1] * columns, [PADDING] * columns
+    match, used, landmark_id = [PADDING] * columns, [-1] * columns, [PADDING] * columns
     for row, measurement in enumerate(frame):
         k, slot = measurement.k, choice[row]
         match[k] = slot
-        birth[k] = particle.landmarks[slot].birth if slot >= 0 else slot
+        landmark_id[k] = particle.landmarks[slot].landmark_id if slot >= 0 else slot
         if slot == CLUTTER:
             particle.log_weight += clutter[row]
         elif slot == NEW:
@@ -249,7 +249,7 @@ def correct(particle, frame, columns, index, model, dull, held):
             log_density = ekf.update(particle.landmarks[slot], measurement, s, dull)
             particle.log_weight += np.log(1 - model.outlier) + log_density
     freed = forget(particle, before, choice, s, model) if model.forgetting else 0
-    return match, used, birth, freed
+    return match, used, landmark_id, freed
 
 
 def in_use(particles):
@@ -329,12 +329,12 @@ def step(particles, odometry, frame, columns, index, normals, uniform, model, he
     outcomes = [nothing] * len(particles)
     row = {"log_evidence": 0.0, "nonfinite": 0, "degenerate": False}
     if frame is not None:
-        dull = dulled(model, odometry)
+        dull = with_extra_noise(model, odometry)
         outcomes = [correct(p, frame, columns, index, model, dull, held) for p in particles]
         held = in_use(particles)
         row = normalise(particles)
-    match, slot, birth, freed = (np.array(part) for part in zip(*outcomes, strict=True))
-    row |= {"match": match, "slot": slot, "birth": birth, "freed": freed, "held": held}
+    match, slot, landmark_id, freed = (np.array(part) for part in zip(*outcomes, strict=True))
+    row |= {"match": match, "slot": slot, "landmark_id": landmark_id, "freed": freed, "held": held}
     row["births"] = np.sum((match == NEW) & (slot >= 0), axis=1)
     row["overflow"] = np.sum((match == NEW) & (slot < 0), axis=1)
 

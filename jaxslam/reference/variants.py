@@ -11,8 +11,8 @@ import numpy as np
 
 from jaxslam.config import Config, default_params
 from jaxslam.logs.truth import truth_at
-from jaxslam.reference.compare import select, thinned
-from jaxslam.results.metrics import align_se2, alignable, ate, map_error, with_truth
+from jaxslam.reference.compare import select_frames, thin
+from jaxslam.results.metrics import align_se2, alignable, ate, has_truth, map_error
 from jaxslam.runs import run
 
 
@@ -34,7 +34,7 @@ def variants(log, config, params=None, seed=0, steps=200, every=None, baselines=
     """`Variant` rows: the `baselines` (`compare.Comparison` of the same frames), then the compiled
     filters with `config.particles` particles. `progress`: as for `runner.run`, for each of them.
     """
-    log = select(log, thinned(log, steps, every))
+    log = select_frames(log, thin(log, steps, every))
     params = default_params(config.sensor, log) if params is None else params
     rows = [_of_baseline(log, row.single) for row in baselines]
     for name, rules in _rules(config).items():
@@ -67,7 +67,7 @@ def _of_baseline(log, found):
 def _measured(name, log, particles, pose, world, seconds):
     """`Variant` of a path [T, 3] and a map with `mean` [L, 2] and `identity` [L]."""
     true, truth = truth_at(log.truth, log.frame_time), log.truth
-    have, error = with_truth(true), {}
+    have, error = has_truth(true), {}
     if truth is not None and truth.landmarks is not None and alignable(true[have, :2]):
         motion = align_se2(pose[have, :2], true[have, :2])
         error = map_error(world.mean, world.identity, truth, motion)

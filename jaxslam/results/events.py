@@ -5,7 +5,7 @@ import numpy as np
 from jaxslam.smoother.events import FAILED, KINDS, MERGED
 
 
-def events(result):
+def list_events(result):
     """A dict for every frame in which something happened; `t` in seconds since the first frame.
 
     `rejuvenated`: which landmarks (by `id`) it `found`, `dropped` or `merged` (with which), or that
@@ -29,11 +29,11 @@ def events(result):
         yield event
 
 
-def ambiguous(result):
+def ambiguous_measurements(result):
     """Frame and slot [n, 2] of the measurements about which the particles differed."""
     if result.entropy is None:
         return np.zeros((0, 2), int)
-    return np.argwhere(result.entropy > UNSURE)
+    return np.argwhere(result.entropy > AMBIGUOUS)
 
 
 def _changed(result):
@@ -52,27 +52,27 @@ def _changed(result):
 def _unsure(result):
     """By frame, pairs of a row of the log and its entropy, where that is not small."""
     unsure = {}
-    for step, k in ambiguous(result).tolist():
+    for step, k in ambiguous_measurements(result).tolist():
         pair = [int(result.row[step, k]), round(float(result.entropy[step, k]), 3)]
         unsure.setdefault(step, []).append(pair)
     return unsure
 
 
-UNSURE = 0.33  # nats: one particle in ten holds something else
+AMBIGUOUS = 0.33  # nats: one particle in ten holds something else
 
 
-def entropy(birth, ancestors):
+def association_entropy(landmark_id, ancestors):
     """Entropy [C, K], nats, of what each measurement of C frames was taken for.
 
-    `birth` [C, K, N] as `filter.Info`; `ancestors` [C, N]: particles count as often as they go on
+    `landmark_id` [C, K, N] as `filter.Info`; `ancestors` [C, N]: particles count as often as they go on
     after the frame, which is by their weight wherever they are resampled. Zero where all agree.
     """
-    found = np.zeros(birth.shape[:2], np.float32)
-    differ = (birth != birth[..., :1]).any(-1)
+    found = np.zeros(landmark_id.shape[:2], np.float32)
+    differ = (landmark_id != landmark_id[..., :1]).any(-1)
     for c in np.flatnonzero(differ.any(1)):
-        lives = np.bincount(ancestors[c], minlength=birth.shape[2])
+        lives = np.bincount(ancestors[c], minlength=landmark_id.shape[2])
         for k in np.flatnonzero(differ[c]):
-            _, held = np.unique(birth[c, k], return_inverse=True)
+            _, held = np.unique(landmark_id[c, k], return_inverse=True)
             share = np.bincount(held, lives) / len(lives)
             share = share[share > 0]
             found[c, k] = max(0.0, -np.sum(share * np.log(share)))

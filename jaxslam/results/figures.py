@@ -25,7 +25,7 @@ from jaxslam.plotting import (
     ellipses,
     write_figure,
 )
-from jaxslam.results.metrics import ate, paths, with_truth
+from jaxslam.results.metrics import ate, has_truth, path_estimates
 
 FIGURES = ("map.png", "error.png", "particles.png")
 
@@ -53,7 +53,7 @@ def draw_map(result):
     figure = Figure(figsize=(max(size[0], 5) + 0.9, size[1] + 1.9), layout="constrained")
     axes = figure.add_subplot()
     _draw_plan(axes, log, core)
-    if with_truth(true).any():
+    if has_truth(true).any():
         _curve(axes, *true[:, :2].T, TRUE, label="true path")
     reckoning = result.dead_reckoning
     axes.plot(*reckoning[:, :2].T, "--", color=RECKONING, lw=0.7, label="dead reckoning", zorder=1)
@@ -123,7 +123,7 @@ def _limits(result, true):
     which may be anywhere, only what lies within a third of that beyond it.
     """
     plan, truth = result.log.plan, result.log.truth
-    room = [true[with_truth(true), :2]]
+    room = [true[has_truth(true), :2]]
     if plan is not None and plan.segments is not None:
         room.append(plan.segments.reshape(-1, 2))
     if plan is not None and plan.image is not None:
@@ -153,12 +153,12 @@ def _corners(points):
 def _title(result, true, low, high):
     config = result.config
     about = f"{config.sensor}, {config.association}".replace("_", " ")
-    have = with_truth(true)
+    have = has_truth(true)
     told = "no true path"
     if have.any():
         errors = [
             f"{ate(path, true, align=False)[0]:.2f} m {name}"
-            for name, path in paths(result).items()
+            for name, path in path_estimates(result).items()
             if name in ("filtered", "refined")
         ]
         told = f"path error {', '.join(errors)} (RMSE, not aligned)"
@@ -189,13 +189,13 @@ def draw_error(result):
     figure = Figure(figsize=(9.5, 7.5), layout="constrained")
     position, heading, drift = figure.subplots(3, 1, sharex=True, height_ratios=(1.25, 1, 1))
     seconds, true = _seconds(result), truth_at(result.log.truth, result.time)
-    known = with_truth(true).any()
+    known = has_truth(true).any()
     _draw_band(position, heading, seconds, result.cov, FILTER, r"filter's own 3$\sigma$")
     if result.refined is not None:
         cov = result.refined.cov
         _draw_band(position, heading, seconds, cov, REFINED, r"refined path's own 3$\sigma$")
     reference = true if known else result.pose
-    found = paths(result)
+    found = path_estimates(result)
     for name in [name for name in LINES if name in found]:
         path, (colour, width, label) = found[name], LINES[name]
         turned = np.degrees(wrap(path - true)[:, 2])

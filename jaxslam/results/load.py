@@ -11,9 +11,9 @@ import numpy as np
 from jaxslam.config import Config, Params
 from jaxslam.logs.log_file import BUNDLED, load_log
 from jaxslam.results.figures import draw_figures
-from jaxslam.results.metrics import errors
+from jaxslam.results.metrics import compute_errors
 from jaxslam.results.result import MapEstimate, Result
-from jaxslam.results.run_folder import COLUMNS, LOOKING_BACK, MAYBE
+from jaxslam.results.run_folder import COLUMNS, FILE_NAMES, LOOKING_BACK, MAYBE
 from jaxslam.smoother.genealogy import Ancestral, Lineage
 
 
@@ -29,12 +29,14 @@ def load_result(directory, log=None):
         summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
         with (
             open(directory / "steps.npz", "rb") as file,
-            np.load(file, allow_pickle=False) as steps,
+            np.load(file, allow_pickle=False) as archive,
         ):
+            names = {stored: name for name, stored in FILE_NAMES.items()}
+            steps = {names.get(stored, stored): archive[stored] for stored in archive.files}
             columns = {name: steps[name] for name in COLUMNS}
-            landmarks = MapEstimate(**_part("map", steps))
-            columns |= _looking_back(steps)
-            columns |= {name: steps[name] for name in MAYBE if name in steps.files}
+            landmarks = MapEstimate(**_columns_of("map", steps))
+            columns |= _smoother_columns(steps)
+            columns |= {name: steps[name] for name in MAYBE if name in steps}
         seed, source = told["seed"], told["log"]
         spent = {name: summary[name] for name in ("seconds", "compile_seconds", "dropped")}
         spent["refine_seconds"] = summary.get("refine_seconds")
@@ -58,16 +60,16 @@ def load_result(directory, log=None):
     )
 
 
-def _part(name, steps):
+def _columns_of(name, steps):
     """The columns of `steps.npz` whose names begin so, without that; numbers as numbers."""
     begin = f"{name}_"
-    columns = {key[len(begin) :]: steps[key] for key in steps.files if key.startswith(begin)}
+    columns = {key[len(begin) :]: steps[key] for key in steps if key.startswith(begin)}
     return {key: value if value.ndim else value.item() for key, value in columns.items()}
 
 
-def _looking_back(steps):
+def _smoother_columns(steps):
     """What a run found out looking back, as far as it is there: older folders have none of it."""
-    found = {name: _part(name, steps) for name in LOOKING_BACK}
+    found = {name: _columns_of(name, steps) for name in LOOKING_BACK}
     kinds = {"ancestral": Ancestral, "lineage": Lineage}
     if found["refined"]:
         from jaxslam.smoother.refine import Refined  # brings JAX, which nothing else here needs
@@ -78,7 +80,7 @@ def _looking_back(steps):
 
 def evaluate_folder(directory, log=None):
     """The errors of a saved run, computed anew from its columns and its log's truth."""
-    return errors(load_result(directory, log))
+    return compute_errors(load_result(directory, log))
 
 
 def _find_log(directory, source):

@@ -33,7 +33,7 @@ def apply_se2(motion, points):
     return np.asarray(points) @ np.array([[c, s], [-s, c]]) + np.array([x, y])
 
 
-def with_truth(truth):
+def has_truth(truth):
     """Which rows [T] of a true path [T, 2 or 3] have a position."""
     return np.isfinite(truth[:, :2]).all(1)
 
@@ -44,7 +44,7 @@ def ate(estimate, truth, align=True):
     `estimate`, `truth`: [T, 2 or 3]. With `align` after the best rigid motion, which needs three
     positions that are not one place; (NaN, NaN) where it can't be computed.
     """
-    have = with_truth(truth)
+    have = has_truth(truth)
     estimate, truth = estimate[have, :2], truth[have, :2]
     if not have.any() or (align and not alignable(truth)):
         return np.nan, np.nan
@@ -82,7 +82,10 @@ def rpe(estimate, truth, distance=1.0, time=None, seconds=None):
     start, end = start[good], end[good]
     if start.size == 0:
         return np.nan, np.nan
-    move_e, move_t = between(estimate[start], estimate[end]), between(truth[start], truth[end])
+    move_e, move_t = (
+        relative_pose(estimate[start], estimate[end]),
+        relative_pose(truth[start], truth[end]),
+    )
     error = move_e - move_t
     error[:, 2] = wrap(error[:, 2])
     return (
@@ -91,7 +94,7 @@ def rpe(estimate, truth, distance=1.0, time=None, seconds=None):
     )
 
 
-def between(a, b):
+def relative_pose(a, b):
     """Pose b [T, 3] seen from pose a [T, 3]."""
     dx, dy = (b - a)[:, 0], (b - a)[:, 1]
     c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
@@ -170,13 +173,13 @@ def map_error(mean, identity, truth, motion=None):
     return found if known else found | {"gate_m": gate}
 
 
-def association_accuracy(result, log=None, match=None):
+def association_accuracy(result, log=None, landmark_id=None):
     """The share of measurements of known origin that were told apart rightly; NaN if there is none.
 
     A match is right if the measurement that created the landmark was of the same true landmark,
     "new" if no measurement of that landmark was called new before, "clutter" if it was clutter (a
     true identity of -1). Without true identities the measured ones serve, and -1 does not count.
-    `match` [T, K]: None for the filter's.
+    `landmark_id` [T, K]: None for the filter's.
     """
     log = result.log if log is None else log
     identity = None if log.truth is None else log.truth.identity
@@ -185,18 +188,19 @@ def association_accuracy(result, log=None, match=None):
     if identity is None or len(identity) == 0:
         return np.nan
     row = np.asarray(result.row).ravel()
-    match = np.asarray(result.match if match is None else match).ravel()
+    landmark_id = result.landmark_id if landmark_id is None else landmark_id
+    landmark_id = np.asarray(landmark_id).ravel()
     who = np.where(row >= 0, np.asarray(identity)[row.clip(0)], -1)
-    counted = (match >= -2) & (row >= 0) & ((who >= 0) | clutter_known)
+    counted = (landmark_id >= -2) & (row >= 0) & ((who >= 0) | clutter_known)
     # A landmark's label is the place (frame * K + k) of the measurement that created it.
-    right = (match >= 0) & (who >= 0) & (who[match.clip(0)] == who)
-    new = np.flatnonzero((match == -1) & (row >= 0) & (who >= 0))
+    right = (landmark_id >= 0) & (who >= 0) & (who[landmark_id.clip(0)] == who)
+    new = np.flatnonzero((landmark_id == -1) & (row >= 0) & (who >= 0))
     right[new[np.unique(who[new], return_index=True)[1]]] = True
-    right |= (match == -2) & (who < 0)
+    right |= (landmark_id == -2) & (who < 0)
     return float(right[counted].mean()) if counted.any() else np.nan
 
 
-def errors(result, log=None):
+def compute_errors(result, log=None):
     """The errors of a run for `summary.json`; a key is absent where it can't be computed.
 
     Empty without truth. `log` (default: the result's own) is where the truth comes from.
@@ -204,18 +208,18 @@ def errors(result, log=None):
     log = result.log if log is None else log
     found = {"association_accuracy": association_accuracy(result, log)}
     if result.refined is not None:
-        again = association_accuracy(result, log, result.refined.match)
+        again = association_accuracy(result, log, result.refined.landmark_id)
         found["association_accuracy_refined"] = again
     if log.truth is not None:
         true = truth_at(log.truth, result.time)
-        if with_truth(true).any():
+        if has_truth(true).any():
             found |= path_errors(result, true, log.truth.resolution)
         if log.truth.landmarks is not None and len(log.truth.landmarks):
             found |= landmark_errors(result, log.truth, true)
     return {key: value for key, value in found.items() if np.isfinite(value)}
 
 
-def paths(result):
+def path_estimates(result):
     """The paths [T, 3] that a run has, by name: filtered, ancestral, refined, dead_reckoning."""
     found = {"filtered": result.pose}
     for name in ("ancestral", "refined"):
@@ -226,10 +230,10 @@ def paths(result):
 
 def path_errors(result, true, resolution):
     """The part of `errors` that needs true poses [T, 3]."""
-    found = {"truth_frames": int(with_truth(true).sum())}
+    found = {"truth_frames": int(has_truth(true).sum())}
     if resolution > 0.1:  # coarser truth says nothing about one metre
         found["truth_resolution_m"] = float(resolution)
-    for name, path in paths(result).items():
+    for name, path in path_estimates(result).items():
         found |= _path_errors(name, path, true, resolution)
     found |= _consistency("nees", result.pose, result.cov, true, resolution)
     if result.refined is not None:
@@ -245,7 +249,7 @@ def _path_errors(name, path, true, resolution):
     ate_name = f"ate_{name}" if ours else f"{name}_ate"
     found = {f"{ate_name}_rmse_m" if ours else f"{ate_name}_m": rmse, f"{ate_name}_max_m": most}
     found[f"{ate_name}_unaligned_rmse_m"], found[f"{ate_name}_unaligned_max_m"] = unaligned
-    last = np.flatnonzero(with_truth(true))[-1]
+    last = np.flatnonzero(has_truth(true))[-1]
     found[f"{name}_end_m"] = float(np.hypot(*(path - true)[last, :2]))
     heading = wrap(path[:, 2] - true[:, 2])
     if ours and np.isfinite(heading).any():
@@ -276,7 +280,7 @@ def landmark_errors(result, truth, true):
 
 def _landmark_errors(name, counts, path, landmarks, truth, true):
     """Of one map, whose path is [T, 3]."""
-    have = with_truth(true)
+    have = has_truth(true)
     kinds = {"_unaligned": None}
     if alignable(true[have, :2]):
         kinds[""] = align_se2(path[have, :2], true[have, :2])

@@ -36,7 +36,7 @@ class Result:
     `time` int64 [T] ns. `pose` [T, 3] (x, y, heading): filtered mean, m and rad, in the frame of
     the log's start pose; `cov` [T, 3, 3]. `ess` [T]; `resampled` [T]; `new` [T]: landmarks begun by
     the best particle; `overflow`, `forgotten`, `outliers` [T]: mean number per particle;
-    `log_evidence` [T]; `nonfinite`, `degenerate` [T]: flags of `filter.Info`. `match` [T, K]: what
+    `log_evidence` [T]; `nonfinite`, `degenerate` [T]: flags of `filter.Info`. `landmark_id` [T, K]: what
     the best particle took each measurement for (frame * K + k of the measurement that began the
     landmark, or -1 new, -2 clutter, -3 padding), `row` [T, K]: the measurement's row in the log.
     `landmarks`: the map at the end. `dead_reckoning` [T, 3]: odometry alone. `dropped`: rows left
@@ -66,7 +66,7 @@ class Result:
     log_evidence: np.ndarray
     nonfinite: np.ndarray
     degenerate: np.ndarray
-    match: np.ndarray
+    landmark_id: np.ndarray
     row: np.ndarray
     landmarks: MapEstimate
     dead_reckoning: np.ndarray
@@ -79,6 +79,11 @@ class Result:
     refine_seconds: float | None = None
     events: np.ndarray | None = None
     entropy: np.ndarray | None = None
+
+    @property
+    def match(self):
+        """`landmark_id` by its name of version 0.1."""
+        return self.landmark_id
 
     @property
     def landmarks_refined(self):

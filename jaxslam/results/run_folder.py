@@ -19,17 +19,23 @@ from platform import python_version
 
 import numpy as np
 
-from jaxslam.files import NO_SPACE, beside, move_folder, sync
+from jaxslam.files import NO_SPACE, fsync_all, move_folder, temporary_sibling
 from jaxslam.logs.log_file import BUNDLED, save_log
 from jaxslam.results import run_lock
-from jaxslam.results.events import ambiguous, events
+from jaxslam.results.events import ambiguous_measurements, list_events
 from jaxslam.results.figures import FIGURES, draw_figures
-from jaxslam.results.metrics import errors
+from jaxslam.results.metrics import compute_errors
 
 COLUMNS = (
     *("time", "pose", "cov", "ess", "resampled", "new", "overflow", "outliers", "forgotten"),
-    *("log_evidence", "nonfinite", "degenerate", "match", "row", "dead_reckoning"),
+    *("log_evidence", "nonfinite", "degenerate", "landmark_id", "row", "dead_reckoning"),
 )
+# Columns of `steps.npz` that keep the name they have had since version 0.1.
+FILE_NAMES = {
+    "landmark_id": "match",
+    "lineage_landmark_id": "lineage_birth",
+    "refined_landmark_id": "refined_match",
+}
 NEEDED = ("run.toml", "summary.json", "steps.npz")  # without these it is no run's folder
 FINISHED = "summary.json"
 CHECKPOINTS, PARTIAL = "checkpoints", ".results"
@@ -54,20 +60,20 @@ def save(result, directory, overwrite=False, log_source=None, figures=True):
     target = directory.resolve()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        partial = beside(target)
+        partial = temporary_sibling(target)
         partial.mkdir()
     except OSError as error:
-        raise _unwritable(directory, error) from error
+        raise _write_error(directory, error) from error
     try:
-        _write_files(result, partial, _source(log_source, target), figures)
+        _write_files(result, partial, _log_reference(log_source, target), figures)
         move_folder(partial, target, overwrite)
     except OSError as error:
-        raise _unwritable(directory, error) from error
+        raise _write_error(directory, error) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def finish(result, directory, log_source=None):
+def save_into(result, directory, log_source=None):
     """Write the results of a long run into its folder: `save` for a folder that is there.
 
     Dying before `summary.json`, the last, is there leaves it unfinished. Raises `OSError` where
@@ -78,14 +84,14 @@ def finish(result, directory, log_source=None):
     clear_results(directory)
     try:
         partial.mkdir()
-        _write_files(result, partial, _source(log_source, directory.resolve()))
+        _write_files(result, partial, _log_reference(log_source, directory.resolve()))
         for path in sorted(partial.iterdir(), key=lambda path: path.name == FINISHED):
             if path.name == FINISHED:
-                sync(directory)
+                fsync_all(directory)
             os.replace(path, directory / path.name)
-        sync(directory)
+        fsync_all(directory)
     except OSError as error:
-        raise _unwritable(directory, error) from error
+        raise _write_error(directory, error) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
@@ -106,7 +112,7 @@ def check_target(directory, overwrite=False, resume=False):
     directory = Path(directory)
     try:
         if directory.exists() or directory.is_symlink():
-            run_lock.check(directory)
+            run_lock.check_unlocked(directory)
             _check_existing(directory, overwrite, resume)
         parent = next(path for path in directory.resolve().parents if path.exists())
         if not parent.is_dir() or not os.access(parent, os.W_OK):
@@ -114,7 +120,7 @@ def check_target(directory, overwrite=False, resume=False):
     except BlockingIOError:
         raise
     except OSError as error:
-        raise _unwritable(directory, error) from error
+        raise _write_error(directory, error) from error
 
 
 def _check_existing(directory, overwrite, resume):
@@ -158,16 +164,16 @@ def summarise(result):
         "overflow": float(np.sum(result.overflow)),
         "dropped_measurements": int(sum(result.dropped.values())),
         "dropped": dict(result.dropped),
-        "ambiguous_measurements": len(ambiguous(result)),
+        "ambiguous_measurements": len(ambiguous_measurements(result)),
         "warnings": list(result.flags),
         "advice": list(result.advice),
-        **_looked_back(result),
+        **_smoother_summary(result),
         "versions": versions(),
-        **errors(result),
+        **compute_errors(result),
     }
 
 
-def _looked_back(result):
+def _smoother_summary(result):
     """The part of `summarise` about the genealogy and the refinement; without them, empty."""
     told = {}
     if result.ancestral is not None:
@@ -239,12 +245,13 @@ def _write_files(result, folder, source, figures=True):
             columns |= {f"{name}_{key}": np.asarray(v) for key, v in table._asdict().items()}
     maybe = {name: getattr(result, name) for name in MAYBE}
     columns |= {name: value for name, value in maybe.items() if value is not None}
+    columns = {FILE_NAMES.get(name, name): column for name, column in columns.items()}
     np.savez_compressed(folder / "steps.npz", **columns)
     files = {
         "run.toml": [run_toml(result, source)],
         "trajectory.tum": tum_lines(result.time, result.pose),
         "landmarks.csv": landmark_lines(result.landmarks),
-        "events.jsonl": (_json(event) + "\n" for event in events(result)),
+        "events.jsonl": (_json(event) + "\n" for event in list_events(result)),
         "summary.json": [_json(summarise(result), indent=2) + "\n"],
     }
     if result.refined is not None:
@@ -255,10 +262,10 @@ def _write_files(result, folder, source, figures=True):
             file.writelines(lines)
     if figures:
         draw_figures(result, folder)
-    sync(*folder.iterdir(), folder)
+    fsync_all(*folder.iterdir(), folder)
 
 
-def _source(log_source, target):
+def _log_reference(log_source, target):
     """What run.toml calls the log: a bundled name or a path; None: keep a copy of it."""
     if log_source is None or (str(log_source) in BUNDLED and not Path(log_source).exists()):
         return log_source
@@ -267,7 +274,7 @@ def _source(log_source, target):
     return None if path.is_relative_to(target) else str(path)
 
 
-def _unwritable(directory, error):
+def _write_error(directory, error):
     """The error to raise instead."""
     if error.errno in NO_SPACE:
         return OSError(error.errno, error.strerror, str(directory))

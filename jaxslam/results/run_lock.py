@@ -8,7 +8,7 @@ from pathlib import Path
 NAME = "lock"
 
 
-def take(folder):
+def acquire(folder):
     """Lock a folder for this process; gives the open file, which keeps the lock until it is closed.
 
     Raises `BlockingIOError` naming the holder where another has it.
@@ -29,7 +29,7 @@ def take(folder):
         os.close(handle)
 
 
-def check(folder):
+def check_unlocked(folder):
     """Raise `BlockingIOError` if another process has this folder locked."""
     path = Path(folder) / NAME
     try:

@@ -11,8 +11,8 @@ from jaxslam.filter import map_estimate, sharding
 from jaxslam.filter import step as fastslam
 from jaxslam.logs.odometry import dead_reckoning
 from jaxslam.results.result import MapEstimate, Result
-from jaxslam.smoother.genealogy import Ancestral, Lineage, Tree, ancestral, lineage
-from jaxslam.smoother.rejuvenation import Past
+from jaxslam.smoother.genealogy import Ancestral, Lineage, Tree, smooth_ancestral, trace_lineage
+from jaxslam.smoother.rejuvenation import SharedPast
 
 
 class Summary(NamedTuple):
@@ -29,19 +29,19 @@ class Summary(NamedTuple):
     log_evidence: jax.Array
     nonfinite: jax.Array
     degenerate: jax.Array
-    match: jax.Array
+    landmark_id: jax.Array
     survivor: jax.Array
 
 
-class Leaves(NamedTuple):
+class ParticleHistory(NamedTuple):
     """What the genealogy needs of every step, of all particles (`filter.Info`)."""
 
     pose: jax.Array
-    birth: jax.Array
+    landmark_id: jax.Array
     ancestors: jax.Array
 
 
-class Filtered(NamedTuple):
+class RunProgress(NamedTuple):
     """How far the filter has come: its `state`, a `Summary` of every chunk (on the host), the
     genealogy (None: too large, or of another process) since the `past` that all share (None:
     none), frames `done`, and `seconds` that took; `entropy` of every chunk (`ambiguity`)."""
@@ -51,16 +51,16 @@ class Filtered(NamedTuple):
     tree: Tree | None
     done: int
     seconds: float
-    past: Past | None
+    past: SharedPast | None
     entropy: list
 
 
-def origin_of(log):
+def local_origin(log):
     """A local origin [3], which keeps coordinates small: float32 has 7 digits."""
     return np.array([*log.start_pose[:2], 0.0])
 
 
-def result_of(at, log, config, params, seed, data, compile_seconds):
+def assemble_result(at, log, config, params, seed, data, compile_seconds):
     """The `Result` of a filter that is done (`Filtered`), not refined."""
     numbers = jax.tree.map(jnp.asarray, params)
     return Result(
@@ -73,24 +73,24 @@ def result_of(at, log, config, params, seed, data, compile_seconds):
         dead_reckoning=dead_reckoning(data.odometry, log.start_pose),
         compile_seconds=compile_seconds,
         dropped=data.dropped,
-        **_found(at, numbers, config, data.identities, origin_of(log)),
+        **_filter_fields(at, numbers, config, data.identities, local_origin(log)),
     )
 
 
-def _found(at, params, config, identities, origin):
+def _filter_fields(at, params, config, identities, origin):
     """The fields of `Result` that the filter found, in the world's frame."""
     begin = time.perf_counter()
     summary = Summary(*(np.concatenate(parts) for parts in zip(*at.summaries, strict=True)))
     best, n = int(summary.survivor[-1]), config.particles
-    state = settled(at.state, config)
-    found = _looking_back(at, sharding.fetched(state.log_weight), best, origin)
+    state = settle_donated(at.state, config)
+    found = _genealogy_fields(at, sharding.to_host(state.log_weight), best, origin)
     return found | dict(
         pose=summary.pose + origin,
         entropy=np.concatenate(at.entropy),
         overflow=summary.overflow / n,
         outliers=summary.outliers / n,
         forgotten=summary.forgotten / n,
-        match=summary.match.astype(np.int64),
+        landmark_id=summary.landmark_id.astype(np.int64),
         landmarks=_map(state, best, params, config, identities, origin),
         seconds=at.seconds + time.perf_counter() - begin,
         **{name: getattr(summary, name) for name in (
@@ -98,31 +98,35 @@ def _found(at, params, config, identities, origin):
     )  # fmt: skip
 
 
-def _looking_back(at, log_weight, best, origin):
+def _genealogy_fields(at, log_weight, best, origin):
     """`Result.ancestral` and `Result.lineage`, in the world's frame, and the past's events."""
     if at.tree is None:
         return dict(events=None if at.past is None else at.past.event)
-    whole, past, before = ancestral(at.tree, log_weight), lineage(at.tree, best), at.past
+    whole, past, before = (
+        smooth_ancestral(at.tree, log_weight),
+        trace_lineage(at.tree, best),
+        at.past,
+    )
     if before is not None:
         # Every particle has drawn a path of its own there.
         alone, cov = np.full(len(before.pose), len(log_weight)), before.cov
         if len(cov) < len(alone):  # the last time failed: as if there were one ancestor
             alone, cov = np.ones_like(alone), np.zeros((len(alone), 3, 3))
-        whole = _joined(Ancestral(before.pose, cov, alone), whole)
-        past = _joined(Lineage(before.pose, before.birth), past)
+        whole = _concatenate(Ancestral(before.pose, cov, alone), whole)
+        past = _concatenate(Lineage(before.pose, before.landmark_id), past)
     return dict(
         ancestral=whole._replace(pose=whole.pose + origin),
-        lineage=Lineage(past.pose + origin, past.birth),
+        lineage=Lineage(past.pose + origin, past.landmark_id),
         events=None if before is None else before.event,
     )
 
 
-def _joined(before, after):
+def _concatenate(before, after):
     """Columns of one stretch of frames and of the next."""
     return type(after)(*map(np.concatenate, zip(before, after, strict=True)))
 
 
-def identity_of(dense, identities):
+def logged_identity(dense, identities):
     """The log's identities of dense ones; -1 stays."""
     return np.append(identities, -1)[np.asarray(dense, np.int64)]
 
@@ -133,9 +137,9 @@ def _map(state, best, params, config, identities, origin):
     table = jax.tree.map(np.asarray, table)
     kept = np.flatnonzero(table.kept)
     # Known identities are slots; without them no slot has one.
-    identity = identity_of(np.where(kept < len(identities), kept, -1), identities)
+    identity = logged_identity(np.where(kept < len(identities), kept, -1), identities)
     return MapEstimate(
-        id=table.birth[kept].astype(np.int64),
+        id=table.landmark_id[kept].astype(np.int64),
         mean=table.mean[:, kept].T + origin[:2],
         cov=table.cov[:, kept].T.astype(float),
         n=table.count[kept].astype(np.int64),
@@ -143,4 +147,4 @@ def _map(state, best, params, config, identities, origin):
     )
 
 
-settled = jax.jit(fastslam.settled, static_argnames="config", donate_argnames="state")
+settle_donated = jax.jit(fastslam.settle, static_argnames="config", donate_argnames="state")

@@ -19,14 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.config import Params
-from jaxslam.files import beside, move_folder, sync
-from jaxslam.filter.sharding import spread
+from jaxslam.files import fsync_all, move_folder, temporary_sibling
+from jaxslam.filter.sharding import map_over_devices
 from jaxslam.parameter_file import validate
 from jaxslam.results import run_folder
-from jaxslam.results.events import entropy
+from jaxslam.results.events import association_entropy
 from jaxslam.runs import compiled, memory
 from jaxslam.runs import run as runner
-from jaxslam.runs.assemble import Filtered, result_of
+from jaxslam.runs.assemble import RunProgress, assemble_result
 from jaxslam.smoother.genealogy import Tree
 
 BYTES = 2**29  # what the states of the runs in one program may take
@@ -60,7 +60,7 @@ class Task(NamedTuple):
     told: dict[str, float]
 
 
-def tasks(seeds, params, sweeps=()):
+def plan_tasks(seeds, params, sweeps=()):
     """A `Task` for every seed and every combination of the sweeps' values, in that order.
 
     `seeds`: text like `0-9` or `1,4,7-9`. `sweeps`: texts like `err_rot=0.05,0.1`. Raises
@@ -73,11 +73,11 @@ def tasks(seeds, params, sweeps=()):
     for values in itertools.product(*axes.values()):
         told = dict(zip(axes, values, strict=True))
         given = validate(params._replace(**told), "--sweep")
-        found += [Task(seed, given, told) for seed in numbers(seeds)]
+        found += [Task(seed, given, told) for seed in parse_seeds(seeds)]
     return found
 
 
-def numbers(text):
+def parse_seeds(text):
     """Seeds of text like `0-9` or `1,4,7-9`, each once."""
     found = []
     for part in text.split(","):
@@ -100,7 +100,7 @@ def _axis(text):
         raise ValueError(f"--sweep {name}: {values!r} are not numbers, like 0.05,0.1") from None
 
 
-def run(log, config, todo, progress=None, refine=True, devices=1):
+def run_tasks(log, config, todo, progress=None, refine=True, devices=1):
     """The `Result` of every `Task`, as `runner.run` gives it.
 
     `progress`: called with (steps done, steps in all, a line) of all runs together. `devices`: how
@@ -110,10 +110,10 @@ def run(log, config, todo, progress=None, refine=True, devices=1):
     if config.devices > 1:
         raise ValueError("Config.devices: several runs are shared, not their particles; must be 1")
     if config.rejuvenate:
-        return _in_turn(log, config, todo, progress, refine)
-    size = memory.of_arrays(compiled.shapes(config))
+        return _run_in_turn(log, config, todo, progress, refine)
+    size = memory.bytes_of(compiled.state_shapes(config))
     most = min(len(todo), max(devices, BYTES // size))
-    memory.check(compiled.needed(config, len(log.frame_time)), config)
+    memory.check_memory(compiled.estimate_memory(config, len(log.frame_time)), config)
     results, steps, total = [], None, len(todo) * len(log.frame_time)
     for first in range(0, len(todo), most):
         group = todo[first : first + most]
@@ -123,12 +123,12 @@ def run(log, config, todo, progress=None, refine=True, devices=1):
         count = len(group)
         # Of one size, so that one compilation serves all; what fills up is left out again.
         group += [group[-1]] * (most - count)
-        steps, found = _together(log, config, group, count, devices, steps, refine)
+        steps, found = _run_together(log, config, group, count, devices, steps, refine)
         results += found
     return results
 
 
-def _in_turn(log, config, todo, progress, refine):
+def _run_in_turn(log, config, todo, progress, refine):
     """Results of runs that stop now and then to be refined, so that no loop can hold several."""
     results, frames = [], len(log.frame_time)
     for i, task in enumerate(todo):
@@ -138,20 +138,20 @@ def _in_turn(log, config, todo, progress, refine):
     return results
 
 
-def _together(log, config, group, count, shared_by, steps, refine):
+def _run_together(log, config, group, count, shared_by, steps, refine):
     """The compiled steps (None: compile them), and results of the first `count` tasks."""
-    data = [runner.framed(log, config, task.params) for task in group]
+    data = [runner.frames_of(log, config, task.params) for task in group]
     params = [jax.tree.map(jnp.asarray, task.params) for task in group]
     keys = [jax.random.key(task.seed) for task in group]
-    states = [runner.started(log, config, key) for key in keys]
-    keys, states, params = map(_stacked, (keys, states, params))
+    states = [runner.initial_state(log, config, key) for key in keys]
+    keys, states, params = map(_stack, (keys, states, params))
     # A chunk hands over what all runs leave behind.
     wide = dataclasses.replace(config, particles=config.particles * len(group))
-    kept = [Filtered(None, [], Tree(), 0, 0.0, None, []) for _ in range(count)]
+    kept = [RunProgress(None, [], Tree(), 0, 0.0, None, []) for _ in range(count)]
     begin, compile_seconds = time.perf_counter(), 0.0
-    for chunks in zip(*(compiled.chunks(part, wide) for part in data), strict=True):
+    for chunks in zip(*(compiled.split_into_chunks(part, wide) for part in data), strict=True):
         length, (odometry, _) = chunks[0]
-        measurements = _stacked([chunk[1] for _, chunk in chunks])
+        measurements = _stack([chunk[1] for _, chunk in chunks])
         given = keys, states, jnp.int32(length), odometry, measurements, params
         if steps is None:
             steps = _scan.lower(*given, config, shared_by).compile()
@@ -161,21 +161,21 @@ def _together(log, config, group, count, shared_by, steps, refine):
         for i, at in enumerate(kept):
             summary, past = jax.tree.map(lambda leaf, i=i: leaf[i], found)
             at.summaries.append(summary)
-            at.entropy.append(entropy(past.birth, past.ancestors))
+            at.entropy.append(association_entropy(past.landmark_id, past.ancestors))
             at.tree.extend(*past)
     spent = (time.perf_counter() - begin - compile_seconds) / len(group)
     results = []
     for i, at in enumerate(kept):
         state = jax.tree.map(lambda leaf, i=i: leaf[i], states)
         at = at._replace(state=state, seconds=spent)
-        result = result_of(
+        result = assemble_result(
             at, log, config, group[i].params, group[i].seed, data[i], compile_seconds
         )
-        results.append(runner.refined(result) if refine else result)
+        results.append(runner.refine_result(result) if refine else result)
     return steps, results
 
 
-def _stacked(trees):
+def _stack(trees):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 
@@ -187,10 +187,10 @@ def _scan(keys, states, count, odometry, measurements, params, config, shared_by
         key, state, measurements, params = run
         return compiled.filter_frames(key, state, count, odometry, measurements, params, config)
 
-    return spread(one, (keys, states, measurements, params), shared_by)
+    return map_over_devices(one, (keys, states, measurements, params), shared_by)
 
 
-def rows(todo, results):
+def summary_rows(todo, results):
     """A dict for every run: seed, what was told, and those of `COLUMNS` that any has (or None)."""
     told = [run_folder.summarise(result) for result in results]
     there = [name for name in COLUMNS if any(name in summary for summary in told)]
@@ -256,7 +256,7 @@ def save(todo, results, folder, overwrite=False, log_source=None):
     check_target(folder, overwrite)
     target = Path(folder).resolve()
     target.parent.mkdir(parents=True, exist_ok=True)
-    partly = beside(target)
+    partly = temporary_sibling(target)
     partly.mkdir()
     try:
         for task, result in zip(todo, results, strict=True):
@@ -264,12 +264,12 @@ def save(todo, results, folder, overwrite=False, log_source=None):
                 [f"seed-{task.seed}", *(f"{k}-{_short(v)}" for k, v in task.told.items())]
             )
             run_folder.save(result, partly / name, log_source=log_source, figures=False)
-        found = rows(todo, results)
+        found = summary_rows(todo, results)
         with open(partly / TABLE, "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, found[0])
             writer.writeheader()
             writer.writerows(found)
-        sync(partly / TABLE, partly)
+        fsync_all(partly / TABLE, partly)
         move_folder(partly, target, overwrite)
     finally:
         shutil.rmtree(partly, ignore_errors=True)

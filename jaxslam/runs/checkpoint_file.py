@@ -12,15 +12,15 @@ from hashlib import sha256
 
 import numpy as np
 
-from jaxslam.files import replacing, sync
-from jaxslam.logs.log_file import entries
+from jaxslam.files import atomic_write, fsync_all
+from jaxslam.logs.log_file import entries_of
 
 FORMAT = 1
 MANIFEST = "manifest"
 PIECE = 1 << 20  # bytes at once: checksum and write while they are in cache
 
 
-def write(path, about, columns):
+def write_checkpoint(path, about, columns):
     """Write a checkpoint, all or nothing.
 
     `about`: a dict for the manifest. `columns`: pairs of a name and a list of arrays, which are
@@ -28,12 +28,12 @@ def write(path, about, columns):
     `OSError` where there is no space, `ValueError` where the place can't be written.
     """
     listed = {}
-    with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
+    with atomic_write(path) as file, zipfile.ZipFile(file, "w") as archive:
         for name, parts in columns:
             listed[name] = _put(archive, name, parts)
         text = json.dumps(about | {"format": FORMAT, "arrays": listed})
         _put(archive, MANIFEST, [np.frombuffer(text.encode(), np.uint8)])
-    sync(path.parent)
+    fsync_all(path.parent)
 
 
 def _put(archive, name, parts):
@@ -56,7 +56,7 @@ def _put(archive, name, parts):
 
 
 @contextmanager
-def reading(path):
+def open_checkpoint(path):
     """A checkpoint's manifest, and a function of a name that reads and checks that array.
 
     Both raise `ValueError` for whatever is not as it was written.
@@ -110,10 +110,10 @@ def _get(archive, name, line):
     return array
 
 
-def of_log(log):
+def digest_of_log(log):
     """SHA-256 of everything in a log."""
     digest = sha256()
-    for name, array in sorted(entries(log).items()):
+    for name, array in sorted(entries_of(log).items()):
         digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

@@ -29,10 +29,10 @@ from jaxslam.models.sensors import Measurements
 from jaxslam.results import run_folder, run_lock
 from jaxslam.runs import checkpoint_file, compiled
 from jaxslam.runs import memory as capacity
-from jaxslam.runs.assemble import Filtered, Summary
-from jaxslam.runs.cluster import differences, end_now
+from jaxslam.runs.assemble import RunProgress, Summary
+from jaxslam.runs.cluster import end_now, find_differences
 from jaxslam.smoother.genealogy import Tree
-from jaxslam.smoother.rejuvenation import Past
+from jaxslam.smoother.rejuvenation import SharedPast
 
 KEPT = 2  # checkpoints
 UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}
@@ -41,7 +41,7 @@ STOP = 2  # what the processes of a run agree on after a chunk: 0 go on, 1 put a
 NO_MATTER = ("devices",)  # settings that do not change the result
 
 
-def seconds(text):
+def parse_interval(text):
     """Seconds of `60`, `60s`, `5m` or `1h`."""
     found = re.fullmatch(r"(\d+\.?\d*|\.\d+)([smh]?)", text.strip())
     if not found or not float(found[1]):
@@ -49,7 +49,7 @@ def seconds(text):
     return float(found[1]) * UNITS[found[2]]
 
 
-def memory(config, steps=1000):
+def memory_of_run(config, steps=1000):
     """`capacity.Memory` that a run of so many steps needs: compiled for it, nothing large made."""
     size, k, looks = compiled.chunk_size(config), config.measurements, {}
     if config.descriptors:
@@ -68,8 +68,10 @@ def memory(config, steps=1000):
         ),
     )
     params = jax.tree.map(jnp.asarray, default_params(config.sensor))
-    steps_compiled = compiled.compiled(config, chunk, params)
-    return capacity.of_compiled(steps_compiled, compiled.needed(config, steps), config)
+    steps_compiled = compiled.compile_loop(config, chunk, params)
+    return capacity.memory_of_compiled(
+        steps_compiled, compiled.estimate_memory(config, steps), config
+    )
 
 
 class Checkpoints:
@@ -90,7 +92,7 @@ class Checkpoints:
         run_folder.check_target(self.folder, self.overwrite, self.resume)
         self._above = [place for place in self.folder.parents if not place.exists()]
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._lock = run_lock.take(self.folder)
+        self._lock = run_lock.acquire(self.folder)
         names = {path.name for path in self.folder.iterdir()} - {run_lock.NAME}
         if names and not (self.resume or self.overwrite):  # another run came in between
             os.close(self._lock)
@@ -115,18 +117,18 @@ class Checkpoints:
     def begin(self, log, config, params, seed):
         """Raise `ValueError` if what there is to go on with is of another run."""
         self._run = {
-            **told(log, config, params, seed),
+            **run_fingerprint(log, config, params, seed),
             "precision": jnp.zeros(()).dtype.name,
         }
         self._readable = []
         for path in self._files() if self.resume else ():
             try:
-                with checkpoint_file.reading(path) as (about, _):
+                with checkpoint_file.open_checkpoint(path) as (about, _):
                     before, versions = about["run"], about["versions"]
             except ValueError as error:
                 self.say(f"warning: a broken checkpoint is left aside: {error}")
                 continue
-            if differing := differences(before, self._run):
+            if differing := find_differences(before, self._run):
                 raise ValueError(f"{self.folder}: is of another run; differing: {differing}")
             if not self._readable and versions != run_folder.versions():
                 self.say("note: other versions wrote this checkpoint: last digits may differ")
@@ -145,11 +147,11 @@ class Checkpoints:
                 continue
             self._kept = [path]
             self.say(f"note: goes on after step {found.done}, from {path.name}")
-            sharding.agreed(found.done)
+            sharding.broadcast_int(found.done)
             return found
         if self.resume:
             self.say(f"note: {self.folder} has nothing to go on with; starts from the beginning")
-        sharding.agreed(0)
+        sharding.broadcast_int(0)
         return None
 
     def claim(self):
@@ -204,14 +206,14 @@ class Checkpoints:
         `line`: how it goes. Raises `KeyboardInterrupt` if it was asked to stop.
         """
         due = time.monotonic() - self._last >= self.every or at.done == total
-        wanted = sharding.agreed(STOP if self.stopped else int(due))
+        wanted = sharding.broadcast_int(STOP if self.stopped else int(due))
         if not wanted:
             return
         path = _path(self._place, at.done)
         about = {"run": self._run, "versions": run_folder.versions(), "done": at.done}
         about |= {"seconds": at.seconds, "genealogy": at.tree is not None}
         about |= {"past": at.past is not None}
-        checkpoint_file.write(path, about, _columns(at))
+        checkpoint_file.write_checkpoint(path, about, _columns(at))
         self._kept.append(path)
         self._prune()
         self._last = time.monotonic()
@@ -241,7 +243,7 @@ class Checkpoints:
                 path.unlink()
 
 
-class Followed:
+class FollowerCheckpoints:
     """What `Checkpoints` are to the other processes of a run: process 0 decides and writes.
 
     `wait`: called when the run is stopped, and does not return.
@@ -255,7 +257,7 @@ class Followed:
 
     def restore(self, shapes):
         """`Filtered` of the checkpoint that process 0 goes on from, or None."""
-        done = sharding.agreed(0)
+        done = sharding.broadcast_int(0)
         if not done:
             return None
         path = _path(self._place, done)
@@ -280,9 +282,9 @@ class Followed:
 
     def reached(self, at, total, line):
         """Give process 0 what it puts aside."""
-        wanted = sharding.agreed(0)
+        wanted = sharding.broadcast_int(0)
         if wanted:
-            for _ in _fetched(at.state):
+            for _ in _state_columns(at.state):
                 pass
         if wanted == STOP:
             self._wait()
@@ -298,20 +300,20 @@ def check_finished(folder, log, config, params, seed):
     if not same:
         raise ValueError(f"{folder}: is finished, but of another log, or part of it")
     before = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8"))
-    if differing := differences(before, _numbers(config, params, seed)):
+    if differing := find_differences(before, _settings(config, params, seed)):
         raise ValueError(f"{folder}: is finished, but of another run; differing: {differing}")
 
 
-def told(log, config, params, seed):
+def run_fingerprint(log, config, params, seed):
     """What a run was told that decides its result, for JSON."""
     return {
         "frames": [len(log.frame_time), *map(int, log.frame_time[[0, -1]])],
-        **_numbers(config, params, seed),
-        "log": checkpoint_file.of_log(log),
+        **_settings(config, params, seed),
+        "log": checkpoint_file.digest_of_log(log),
     }
 
 
-def _numbers(config, params, seed):
+def _settings(config, params, seed):
     """`told` but for the log."""
     return {
         "seed": int(seed),
@@ -330,15 +332,15 @@ def _names(state):
     return [("state" + jax.tree_util.keystr(path), leaf) for path, leaf in pairs]
 
 
-def _fetched(state):
+def _state_columns(state):
     """Names and arrays, of which only one at a time is fetched."""
     for name, leaf in _names(state):
-        yield name, [sharding.fetched(leaf)]
+        yield name, [sharding.to_host(leaf)]
 
 
 def _columns(at):
     """What a checkpoint holds."""
-    yield from _fetched(at.state)
+    yield from _state_columns(at.state)
     yield "entropy", at.entropy
     for name in at.summaries[0]._fields:
         yield f"summary.{name}", [getattr(part, name) for part in at.summaries]
@@ -347,16 +349,20 @@ def _columns(at):
             yield f"past.{name}", [column]
     if at.tree is not None:
         yield "tree.nodes", [np.array([len(level) for level in at.tree.pose])]
-        for name in ("pose", "birth", "origin"):
+        for name in ("pose", "landmark_id", "origin"):
             yield f"tree.{name}", getattr(at.tree, name)
 
 
 def _read(path, shapes):
     """`Filtered` of a checkpoint. Raises `ValueError` if anything in it is not sound."""
-    with checkpoint_file.reading(path) as (about, get):
+    with checkpoint_file.open_checkpoint(path) as (about, get):
         summary = Summary(*(get(f"summary.{name}") for name in Summary._fields))
-        tree = _tree(get) if about["genealogy"] and sharding.leads() else None
-        past = Past(*(get(f"past.{name}") for name in Past._fields)) if about["past"] else None
+        tree = _tree(get) if about["genealogy"] and sharding.is_leader() else None
+        past = (
+            SharedPast(*(get(f"past.{name}") for name in SharedPast._fields))
+            if about["past"]
+            else None
+        )
         named, leaves = _names(shapes), {}
         # The largest first: while an array is copied to the device, it is there twice.
         for name, shape in sorted(named, key=lambda pair: -math.prod(pair[1].shape)):
@@ -364,9 +370,9 @@ def _read(path, shapes):
             if (array.shape, array.dtype) != (shape.shape, shape.dtype):
                 raise ValueError(f"{path.name}: {name} has another shape or type")
             # A copy: memory of NumPy's can't be given up.
-            leaves[name] = sharding.sent(array, shape)
+            leaves[name] = sharding.to_devices(array, shape)
         state = jax.tree.unflatten(jax.tree.structure(shapes), [leaves[name] for name, _ in named])
-        return Filtered(
+        return RunProgress(
             state, [summary], tree, about["done"], about["seconds"], past, [get("entropy")]
         )
 
@@ -375,7 +381,7 @@ def _tree(get):
     """The genealogy, level by level; copies, since the levels die one by one."""
     tree, nodes = Tree(), get("tree.nodes")
     ends = np.cumsum(nodes)
-    for name in ("pose", "birth"):
+    for name in ("pose", "landmark_id"):
         setattr(tree, name, [part.copy() for part in np.split(get(f"tree.{name}"), ends[:-1])])
     # The nodes of a level point to the level before; the last ones' children are the particles.
     ends = np.cumsum(nodes[1:])

@@ -25,7 +25,7 @@ PATIENCE = 5.0  # seconds for what takes no time
 LONGEST = 2**16  # bytes of a line
 
 
-class Place(NamedTuple):
+class ClusterAddress(NamedTuple):
     """Where the processes meet, how many there are, and which one this is."""
 
     host: str
@@ -38,7 +38,7 @@ class Place(NamedTuple):
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
 
-def place(coordinator=None, processes=None, process=None, env=os.environ):
+def find_address(coordinator=None, processes=None, process=None, env=os.environ):
     """`Place` as the three options say, or Slurm or Open MPI where they don't; None: alone, as with
     `processes` 1 whatever a launcher says.
 
@@ -47,7 +47,7 @@ def place(coordinator=None, processes=None, process=None, env=os.environ):
     given = (coordinator, processes, process)
     if given == (None, 1, None):
         return None
-    given = [a if a is not None else b for a, b in zip(given, _launched(env), strict=True)]
+    given = [a if a is not None else b for a, b in zip(given, _from_launcher(env), strict=True)]
     names = "--coordinator", "--num-processes", "--process-id"
     missing = [name for name, value in zip(names, given, strict=True) if value is None]
     if len(missing) == 3:
@@ -64,10 +64,10 @@ def place(coordinator=None, processes=None, process=None, env=os.environ):
         )
     if processes == 1:
         return None
-    return Place(found[1].strip("[]"), int(found[2]), processes, process)
+    return ClusterAddress(found[1].strip("[]"), int(found[2]), processes, process)
 
 
-def _launched(env):
+def _from_launcher(env):
     """Address, processes and process as a launcher tells them; None for what it does not."""
     if int(env.get("SLURM_STEP_NUM_TASKS", 1)) > 1 and "SLURM_PROCID" in env:
         # The first of `node001`, `node001,x2` or `node[001-015,020],x2`.
@@ -89,7 +89,7 @@ def _launched(env):
 _ORTE = "OMPI_MCA_orte_hnp_uri"
 
 
-def meet(place, run, limit=LIMIT):
+def rendezvous(place, run, limit=LIMIT):
     """Connections to the other processes (of process 0), or to process 0, by process; when all are
     there and were told the same `run`, a dict for JSON.
 
@@ -142,7 +142,7 @@ def _greet(link, place, run, found):
         problem = f"two processes have --process-id {process}"
     elif count != place.processes:
         problem = f"process {process} has --num-processes {count}, process 0 {place.processes}"
-    elif differing := differences(run, other):
+    elif differing := find_differences(run, other):
         problem = f"process {process} was told otherwise than process 0: {differing}"
     if problem:
         _send(link, f"no {problem}")
@@ -184,7 +184,7 @@ def _call(place, run, limit):
     )
 
 
-def differences(told, run):
+def find_differences(told, run):
     """What differs between two runs, as one line; empty: nothing. A setting that an earlier version
     did not have counts as its default."""
     usual = {"config": {f.name: f.default for f in fields(Config) if f.default is not None}}
@@ -295,7 +295,7 @@ def end_now(line, code):
 
 
 @contextmanager
-def quiet():
+def silence_stderr():
     """Within this nothing gets to stdout, where Gloo says whom it reached."""
     sys.stdout.flush()
     kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)

@@ -9,14 +9,14 @@ import numpy as np
 from jaxslam.filter import sharding
 from jaxslam.filter import step as fastslam
 from jaxslam.runs import memory as capacity
-from jaxslam.runs.assemble import Leaves, Summary
+from jaxslam.runs.assemble import ParticleHistory, Summary
 
 CHUNK = 256  # frames per compiled loop, at most: one compilation serves logs of every length
 CHUNK_BYTES = 2**28  # what a chunk may hand over, at most
 TREE_BYTES = 2**31  # what the genealogy may take; beyond that it is given up
 
 
-def shapes(config):
+def state_shapes(config):
     """Shapes, types and places of the `State`, none of it made."""
     state = jax.eval_shape(lambda key: fastslam.init(config, key), jax.random.key(0))
     state = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), state)
@@ -29,48 +29,48 @@ def shapes(config):
     )
 
 
-def compiled(config, chunk, params):
+def compile_loop(config, chunk, params):
     """The compiled loop over a chunk of frames; the state need not be there yet."""
     shapes_of = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct(np.shape(leaf), jnp.result_type(leaf)), (*chunk, params)
     )
     leaves, kind = jax.tree.flatten(shapes_of)
-    return _compiled(config, tuple(leaves), kind)
+    return _compile(config, tuple(leaves), kind)
 
 
 @lru_cache(maxsize=2)
-def _compiled(config, leaves, kind):
-    given = shapes(config), jnp.int32(0), *jax.tree.unflatten(kind, leaves)
+def _compile(config, leaves, kind):
+    given = state_shapes(config), jnp.int32(0), *jax.tree.unflatten(kind, leaves)
     # The state is given up (donated): no second copy of the map.
     steps = jax.jit(
         filter_frames,
         static_argnames="config",
         donate_argnames="state",
-        out_shardings=_places(config),
+        out_shardings=_output_shardings(config),
     )
     return steps.lower(jax.random.key(0), *given, config).compile()
 
 
-def _places(config):
+def _output_shardings(config):
     """Where what `filter_frames` gives belongs: its state is to fit the next chunk's."""
     if config.devices == 1:
         return None
     lanes = jax.sharding.PartitionSpec(None, None, sharding.AXIS)
-    past = Leaves(pose=lanes, birth=lanes, ancestors=sharding.ALL)
+    past = ParticleHistory(pose=lanes, landmark_id=lanes, ancestors=sharding.ALL)
     places = Summary(*[sharding.ALL] * len(Summary._fields)), past
-    return jax.tree.map(lambda leaf: leaf.sharding, shapes(config)), sharding.shardings(
+    return jax.tree.map(lambda leaf: leaf.sharding, state_shapes(config)), sharding.shardings(
         places, config
     )
 
 
-def needed(config, steps):
+def estimate_memory(config, steps):
     """`capacity.Memory` of a run of so many steps, as far as it is known before compiling."""
     row = 4 * (config.measurements + 4)  # bytes of a node of the genealogy, or of `Leaves`
     chunk = min(steps, chunk_size(config)) * row * config.particles
     if config.rejuvenate:  # the draws, and what becomes of them
         chunk = max(chunk, 3 * 4 * (3 + 2 * config.landmarks) * config.particles)
     tree = min(TREE_BYTES, steps * row * config.particles)
-    return capacity.Memory(capacity.of_arrays(shapes(config)), chunk, tree, 0)
+    return capacity.Memory(capacity.bytes_of(state_shapes(config)), chunk, tree, 0)
 
 
 def _summarise(info):
@@ -79,12 +79,12 @@ def _summarise(info):
     summary = Summary(
         pose=info.estimate.mean,
         cov=info.estimate.cov,
-        match=info.birth[:, info.estimate.best],
+        landmark_id=info.landmark_id[:, info.estimate.best],
         survivor=survivor,
         **{name: getattr(info, name) for name in Summary._fields if hasattr(info, name)
-           and name not in ("pose", "match")},
+           and name not in ("pose", "landmark_id")},
     )  # fmt: skip
-    return summary, Leaves(info.pose, info.birth, info.ancestors)
+    return summary, ParticleHistory(info.pose, info.landmark_id, info.ancestors)
 
 
 def filter_frames(key, state, count, odometry, measurements, params, config):
@@ -121,7 +121,7 @@ def chunk_size(config):
     return max(2, min(CHUNK, CHUNK_BYTES // frame))
 
 
-def chunks(data, config, start=0, stops=()):
+def split_into_chunks(data, config, start=0, stops=()):
     """The frames from `start` on in chunks of one length: how many, and what is short filled up.
     None goes beyond one of the `stops`, numbers of frames done."""
     real = jnp.zeros(()).dtype

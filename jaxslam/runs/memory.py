@@ -31,7 +31,7 @@ class Memory(NamedTuple):
         return f"{_gb(self.total)} ({', '.join(parts)})"
 
 
-def of_arrays(tree):
+def bytes_of(tree):
     """Bytes of all arrays, or shapes of arrays, in a tree; where devices share them, what lies in
     the memory that `available` is about."""
     return sum(_size(leaf) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
@@ -49,7 +49,7 @@ def _together(devices):
     return devices // jax.process_count() if jax.devices()[0].platform == "cpu" else 1
 
 
-def of_compiled(compiled, memory, config):
+def memory_of_compiled(compiled, memory, config):
     """`memory` with the compiler's own figures of a chunk whose state is donated."""
     told = compiled.memory_analysis()
     if told is None:  # not every backend says
@@ -63,9 +63,9 @@ def of_compiled(compiled, memory, config):
     return memory._replace(chunk=handed + max(inputs, 0) + whole, temporaries=temporaries)
 
 
-def check(memory, config):
+def check_memory(memory, config):
     """Raise `ValueError` if this does not fit, with the number of particles that would."""
-    free = available()
+    free = available_bytes()
     if free is None or memory.total <= free:
         return
     n, fixed = config.particles, memory.chunk + memory.genealogy
@@ -79,18 +79,18 @@ def check(memory, config):
     )
 
 
-def available():
+def available_bytes():
     """Bytes that can still be had on the first device here; None: not known."""
     device = jax.local_devices()[0]
     if device.platform != "cpu":
         told = device.memory_stats() or {}
         limit = told.get("bytes_limit")
         return None if limit is None else limit - told.get("bytes_in_use", 0)
-    found = [size for size in (_of_machine(), *_of_groups()) if size is not None]
+    found = [size for size in (_machine_bytes(), *_cgroup_bytes()) if size is not None]
     return min(found, default=None)
 
 
-def resident():
+def resident_bytes():
     """Bytes of memory this process has now; None: not known."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -98,16 +98,16 @@ def resident():
         return None
 
 
-def give_back():
+def trim_heap():
     """Hand memory that was freed back to the system: after compiling it is hundreds of megabytes,
     which the C library would keep. Only glibc can; elsewhere nothing is done."""
     with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def tell(memory):
+def print_memory(memory):
     """One line about the need, on stderr."""
-    free = available()
+    free = available_bytes()
     said = "" if free is None else f"; {_gb(free)} are free"
     print(f"note: memory needed: {memory}{said}", file=sys.stderr)
 
@@ -116,7 +116,7 @@ def _gb(size):
     return f"{size / 1e9:.3g} GB" if size >= 1e8 else f"{size / 1e6:.3g} MB"
 
 
-def _of_machine():
+def _machine_bytes():
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:
@@ -125,7 +125,7 @@ def _of_machine():
     return told and int(told[1]) * 1024
 
 
-def _of_groups(groups=GROUPS, own=Path("/proc/self/cgroup")):
+def _cgroup_bytes(groups=GROUPS, own=Path("/proc/self/cgroup")):
     """What is left of the limits of this process's control groups, versions 1 and 2."""
     try:
         lines = own.read_text().splitlines()

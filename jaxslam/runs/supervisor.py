@@ -11,7 +11,7 @@ import threading
 from jaxslam.runs.cluster import LOST
 
 
-def go_on_watched():
+def run_supervised():
     """Go on in a child, begun before JAX is there; the process that was here ends as it does.
 
     Of what the child says on stderr only its own lines are shown, unless it fails without one.

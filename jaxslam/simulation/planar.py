@@ -78,7 +78,7 @@ def _draw(given):
     run = _stop_and_go if given.commands else _roll
     odometry_time, odometry, frame_time, pose = run(rng, loop, given, mean, start)
     if given.clearance:
-        marks = _cleared(rng, marks, sqrt(area), pose, given.clearance)
+        marks = _keep_clear(rng, marks, sqrt(area), pose, given.clearance)
     looks = [_look(rng, p, marks, given) for p in pose]
     ranges, bearings, identity = (np.concatenate(column) for column in zip(*looks, strict=True))
     noise = {name: getattr(given, name) for name in NOISE}
@@ -104,7 +104,7 @@ def _draw(given):
     )
 
 
-def _cleared(rng, marks, side, pose, clearance):
+def _keep_clear(rng, marks, side, pose, clearance):
     """Landmarks in a square of this side, those in the way moved elsewhere at random."""
     path = np.vstack([np.linspace(a, b, 9) for a, b in pairwise(pose[:, :2])] or [pose[:, :2]])
     for _ in range(1000):

@@ -21,39 +21,39 @@ class Ancestral(NamedTuple):
 
 
 class Lineage(NamedTuple):
-    """One particle's whole past: `pose` [T, 3] and `birth` [T, K], as `filter.Info.birth`."""
+    """One particle's whole past: `pose` [T, 3] and `landmark_id` [T, K], as `filter.Info.landmark_id`."""
 
     pose: np.ndarray
-    birth: np.ndarray
+    landmark_id: np.ndarray
 
 
 class Tree:
     """Every pose that still has a living descendant, frame by frame.
 
-    Level t has n_t nodes: `pose[t]` [n_t, 3] and `birth[t]` [n_t, K]. `origin[t]` [n_(t+1)] are the
+    Level t has n_t nodes: `pose[t]` [n_t, 3] and `landmark_id[t]` [n_t, K]. `origin[t]` [n_(t+1)] are the
     rows of level t that the nodes of the next descend from; the last one's, [N], are the particles.
     """
 
     def __init__(self):
-        self.pose, self.birth, self.origin = [], [], []
+        self.pose, self.landmark_id, self.origin = [], [], []
 
     @property
     def nodes(self):
         return sum(map(len, self.pose))
 
-    def extend(self, pose, birth, ancestors):
-        """Add C frames: `pose` [C, 3, N] and `birth` [C, K, N] of all particles before resampling,
+    def extend(self, pose, landmark_id, ancestors):
+        """Add C frames: `pose` [C, 3, N] and `landmark_id` [C, K, N] of all particles before resampling,
         and `ancestors` [C, N]: which of them each particle after it continues."""
         first, levels = len(self.pose), []
         follow = ancestors[-1]
         for t in reversed(range(len(ancestors))):
             alive, rows = _used(follow, ancestors.shape[1])
-            levels.append((pose[t].T[alive], birth[t].T[alive], rows))
+            levels.append((pose[t].T[alive], landmark_id[t].T[alive], rows))
             follow = ancestors[t - 1][alive]
         if first:
             self.origin[-1] = self.origin[-1][alive]
         for level in reversed(levels):
-            for column, part in zip((self.pose, self.birth, self.origin), level, strict=True):
+            for column, part in zip((self.pose, self.landmark_id, self.origin), level, strict=True):
                 column.append(part)
         self._prune(first)
 
@@ -63,7 +63,7 @@ class Tree:
             alive, self.origin[t] = _used(self.origin[t], len(self.pose[t]))
             if len(alive) == len(self.pose[t]):  # then nothing older has lost a child either
                 break
-            self.pose[t], self.birth[t] = self.pose[t][alive], self.birth[t][alive]
+            self.pose[t], self.landmark_id[t] = self.pose[t][alive], self.landmark_id[t][alive]
             if t:
                 self.origin[t - 1] = self.origin[t - 1][alive]
 
@@ -76,7 +76,7 @@ def _used(rows, n):
     return np.flatnonzero(used), place[rows]
 
 
-def ancestral(tree, log_weight):
+def smooth_ancestral(tree, log_weight):
     """`Ancestral`: the weighted mean and covariance of whole paths, by the final `log_weight` [N].
 
     The heading's mean is circular. Particles without weight do not count as descendants.
@@ -104,14 +104,14 @@ def _moments(pose, weight):
     return mean, (off * weight[:, None]).T @ off
 
 
-def lineage(tree, particle):
+def trace_lineage(tree, particle):
     """`Lineage` of one of the living particles."""
     row, rows = particle, []
     for origin in reversed(tree.origin):
         row = int(origin[row])
         rows.append(row)
-    pose, birth = (
+    pose, landmark_id = (
         np.stack([level[row] for level, row in zip(column, reversed(rows), strict=True)])
-        for column in (tree.pose, tree.birth)
+        for column in (tree.pose, tree.landmark_id)
     )
-    return Lineage(pose.astype(float), birth.astype(np.int64))
+    return Lineage(pose.astype(float), landmark_id.astype(np.int64))

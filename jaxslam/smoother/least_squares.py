@@ -64,7 +64,7 @@ class Fit(NamedTuple):
     converged: bool
 
 
-def problem(frames, start_pose, start_cov, params, sensor):
+def make_problem(frames, start_pose, start_cov, params, sensor):
     """`Problem` of `frames.Frames`, and where the measurements stand in it: flat indices [M]."""
     params = Params(*(np.float64(np.asarray(value)) for value in params))
     slots = frames.measurements
@@ -72,7 +72,7 @@ def problem(frames, start_pose, start_cov, params, sensor):
     place = np.flatnonzero(slots.valid & np.asarray(slots.active)[:, None])
     frame = place // count
     odometry = Odometry(*(np.asarray(part, float) for part in frames.odometry))
-    noise = jax.vmap(lambda interval: sensors.correlated(params, interval))(odometry)
+    noise = jax.vmap(lambda interval: sensors.correlated_noise(params, interval))(odometry)
     # All standard deviations are enlarged alike.
     share = (params.position_scale / np.asarray(noise.position_scale)) ** 2
     value = np.asarray(slots.value, float).reshape(-1, 2)[place]
@@ -95,7 +95,7 @@ def problem(frames, start_pose, start_cov, params, sensor):
     ), place
 
 
-def until(given, place, done):
+def truncate(given, place, done):
     """The problem of the first `done` intervals, and where its measurements stand."""
     count = np.searchsorted(given.frame, done)
     part = {name: getattr(given, name)[:count] for name in ("frame", "value", "cov", "share")}
@@ -103,7 +103,7 @@ def until(given, place, done):
     return given._replace(odometry=odometry, **part), place[:count]
 
 
-def fit(given, path, points, which, widths, progress=None):
+def solve(given, path, points, which, widths, progress=None):
     """`Fit` of the path and of points [L, 2], from a start; `which` [M]: point measured, or -1.
 
     `widths`: factors on the measurements' standard deviations in their weights, one after the
@@ -116,7 +116,7 @@ def fit(given, path, points, which, widths, progress=None):
     linear = _linearise(given, path, points, which)
     inlier, cost = _weigh(given, linear, which, 1.0)
     weight = inlier * given.share
-    normal, factor = _taken_apart(given, linear, weight, which, len(points))
+    normal, factor = _split_unknowns(given, linear, weight, which, len(points))
     sure = inlier > 0.5
     square = linear.seen[0][sure] ** 2
     return Fit(
@@ -132,7 +132,7 @@ def fit(given, path, points, which, widths, progress=None):
     )
 
 
-def _taken_apart(given, linear, weight, which, size):
+def _split_unknowns(given, linear, weight, which, size):
     """The normal matrix and its `chain.Factor`.
 
     A point that ran off to where nothing holds it makes the matrix singular to rounding: then it is
@@ -293,10 +293,10 @@ def _assemble(given, linear, weight, which, size, damping):
     used = which >= 0
     rest, by_pose, by_point = (part[used] for part in linear.seen)
     which, pose, weight = which[used], given.frame[used] + 1, weight[used, None, None]
-    diagonal += sums(pose, weight * _outer(by_pose, by_pose), len(diagonal))
+    diagonal += segment_sums(pose, weight * _outer(by_pose, by_pose), len(diagonal))
     drive = -weight[:, 0] * np.einsum("mij,mi->mj", by_pose, rest)
-    pose_gradient += sums(pose, drive, len(diagonal))
-    corner = more * sums(which, weight * _outer(by_point, by_point), size)
+    pose_gradient += segment_sums(pose, drive, len(diagonal))
+    corner = more * segment_sums(which, weight * _outer(by_point, by_point), size)
     pull = -weight[:, 0] * np.einsum("mij,mi->mj", by_point, rest)
     block = weight * _outer(by_point, by_pose)
     row = 2 * which[:, None, None] + np.arange(2)[:, None] + np.zeros((1, 3), int)
@@ -310,7 +310,7 @@ def _assemble(given, linear, weight, which, size, damping):
         border=border.tocsr(),
         corner=corner + LEAST_INFORMATION * np.eye(2),
         pose_gradient=pose_gradient,
-        point_gradient=sums(which, pull, size),
+        point_gradient=segment_sums(which, pull, size),
     )
 
 
@@ -319,7 +319,7 @@ def _outer(a, b):
     return a.transpose(0, 2, 1) @ b
 
 
-def sums(index, parts, size):
+def segment_sums(index, parts, size):
     """Sums [size, ...] of the parts [M, ...] that share an index."""
     inner = int(np.prod(parts.shape[1:]))
     place = index[:, None] * inner + np.arange(inner)

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.linalg import cho_solve_banded
 
 from jaxslam.filter import appearance, candidate_slots, landmarks
-from jaxslam.filter.step import fresh, made
-from jaxslam.filter.xla import pinned
+from jaxslam.filter.step import fresh_state, make_on_devices
+from jaxslam.filter.xla import barrier
 from jaxslam.models.geometry import norm, wrap
 
 STREAM = 2**31 - 2  # sets these random numbers apart from those of the steps
@@ -30,7 +30,7 @@ class Joint(NamedTuple):
     of the pose and of the points' conditional means. `kind` [M]: `NONE`, a world `POINT` whose
     depth is known, or `YOUNG`: a direction and inverse depth, carried along with the pose. `mean`
     [2, M], `factor` [3, M] (the path known), `anchor` [2, M] (`YOUNG`: all as seen from the robot);
-    `log_odds`, `count`, `birth` [M] as `landmarks.Landmarks`.
+    `log_odds`, `count`, `landmark_id` [M] as `landmarks.Landmarks`.
     """
 
     pose: np.ndarray
@@ -42,10 +42,10 @@ class Joint(NamedTuple):
     anchor: np.ndarray
     log_odds: np.ndarray
     count: np.ndarray
-    birth: np.ndarray
+    landmark_id: np.ndarray
 
 
-def nothing(slots):
+def empty_joint(slots):
     """`Joint` of no landmarks, to be filled in."""
     size = 3 + 2 * slots
     return Joint(
@@ -58,7 +58,7 @@ def nothing(slots):
         anchor=np.zeros((2, slots), np.float32),
         log_odds=np.zeros(slots, np.float32),
         count=np.zeros(slots, np.int32),
-        birth=np.zeros(slots, np.int32),
+        landmark_id=np.zeros(slots, np.int32),
     )
 
 
@@ -86,34 +86,38 @@ def covariance(fit):
     return (whole + whole.T) / 2
 
 
-def root_of(cov):
+def factor_of(cov):
     """A square root of a covariance that may be singular."""
     values, vectors = np.linalg.eigh(cov)
     return vectors * np.sqrt(np.maximum(values, 0))
 
 
-def drawn(key, joint, step, config, known=None):
+def draw_state(key, joint, step, config, known=None):
     """`State` at `step`: N particles of equal weight drawn from a `Joint`; `known`: `looks.Looks`
     of the state before, or None."""
-    return made(_drawn, config, key, joint, jnp.int32(step), known)
+    return make_on_devices(_draw, config, key, joint, jnp.int32(step), known)
 
 
 @partial(jax.jit, static_argnames="config")
-def _drawn(key, joint, step, known, config):
+def _draw(key, joint, step, known, config):
     n, slots = config.particles, config.landmarks
     key = jax.random.fold_in(jax.random.fold_in(key, STREAM), step)
 
     def more(j, off):
         # One column after the other: how a matrix product adds up depends on the devices.
-        normal = pinned(jax.random.normal(jax.random.fold_in(key, j), (n,), float))
-        return off + pinned(joint.root[:, j, None] * normal)
+        normal = barrier(jax.random.normal(jax.random.fold_in(key, j), (n,), float))
+        return off + barrier(joint.root[:, j, None] * normal)
 
     off = jax.lax.fori_loop(0, joint.used, more, jnp.zeros((len(joint.root), n), float))
     pose = joint.pose[:, None] + off[:3]
-    pose = pinned(pose.at[2].set(wrap(pose[2])))
+    pose = barrier(pose.at[2].set(wrap(pose[2])))
     world = _map(joint, pose, off[3:].reshape(slots, 2, n), config)
-    state = fresh(pose, world, step, candidate_slots.of_rows(world), config)
-    return state if known is None else state._replace(looks=appearance.moved(known, joint.birth))
+    state = fresh_state(pose, world, step, candidate_slots.bounds_of(world), config)
+    return (
+        state
+        if known is None
+        else state._replace(looks=appearance.reorder_slots(known, joint.landmark_id))
+    )
 
 
 def _map(joint, pose, off, config):
@@ -132,12 +136,12 @@ def _map(joint, pose, off, config):
         anchor = jnp.where(kind == POINT, anchor, place)
     there = kind != NONE
     return landmarks.Landmarks(
-        mean=pinned(jnp.where(there, mean, 0.0)),
-        factor=pinned(jnp.where(there, factor, 0.0)),
-        anchor=None if anchor is None else pinned(jnp.where(there, anchor, 0.0)),
+        mean=barrier(jnp.where(there, mean, 0.0)),
+        factor=barrier(jnp.where(there, factor, 0.0)),
+        anchor=None if anchor is None else barrier(jnp.where(there, anchor, 0.0)),
         log_odds=jnp.broadcast_to(joint.log_odds[:, None], shape) if config.forgetting else None,
         count=jnp.broadcast_to(joint.count[:, None], shape),
-        birth=jnp.broadcast_to(joint.birth[:, None], shape),
+        landmark_id=jnp.broadcast_to(joint.landmark_id[:, None], shape),
     )
 
 

@@ -30,7 +30,7 @@ class Groups(NamedTuple):
     point: np.ndarray
 
 
-def inside(groups):
+def in_field_of_view(groups):
     """Rows of the groups in the map [L], and the place in the map [M] of every measurement's
     landmark (-1: not there)."""
     rows = np.flatnonzero(np.isfinite(groups.point[:, 0]))
@@ -39,7 +39,7 @@ def inside(groups):
     return rows, place[groups.of]
 
 
-def located(given, path, groups):
+def locate(given, path, groups):
     """The groups with points for those that have none and can be triangulated."""
     missing = ~np.isfinite(groups.point[:, 0])
     if not missing.any():
@@ -49,14 +49,14 @@ def located(given, path, groups):
     return groups._replace(point=np.where(missing[:, None], point, groups.point))
 
 
-def checked(given, fit, groups, known, confirmed=True):
+def check_groups(given, fit, groups, known, confirmed=True):
     """The groups after a look at the refined map, and the pairs of labels that were merged: of the
     one that is no more, and of what it is now.
 
     Known identities only lose landmarks whose depth is open. `confirmed`: landmarks must have been
     seen as often as those of a final map; else more often than not.
     """
-    rows, which = inside(groups)
+    rows, which = in_field_of_view(groups)
     keep = np.ones(len(rows), bool)
     merged = []
     if not known:
@@ -75,15 +75,15 @@ def checked(given, fit, groups, known, confirmed=True):
             which = np.where(groups.of == -1, -1, which)
             which = _chosen(given, fit, which, keep, free=(which >= 0) | (groups.of == -1))
     if given.sensor == "bearing":
-        keep &= ripe(given, fit, which) | bool(merged)
-    waiting = (groups.of >= 0) & (inside(groups)[1] < 0)
+        keep &= is_locatable(given, fit, which) | bool(merged)
+    waiting = (groups.of >= 0) & (in_field_of_view(groups)[1] < 0)
     point = groups.point.copy()
     point[rows[~keep]] = np.nan
     of = np.where(waiting, groups.of, np.append(rows, -1)[which]) if not known else groups.of
     return Groups(of, groups.label, point), merged
 
 
-def ripe(given, fit, which):
+def is_locatable(given, fit, which):
     """Which points [L] have a depth: their uncertainty, the path known, is small beside it."""
     used = which >= 0
     away = _places(given, fit.path)[used, :2] - fit.points[which[used]]
@@ -131,10 +131,10 @@ def _from_bearings(given, place, groups):
     offset = np.sum(across * sensor, 1)
     weight = given.share[used]
     for _ in range(SWEEPS):
-        matrix = least_squares.sums(
+        matrix = least_squares.segment_sums(
             of, weight[:, None, None] * across[:, :, None] * across[:, None], size
         )
-        right = least_squares.sums(of, (weight * offset)[:, None] * across, size)
+        right = least_squares.segment_sums(of, (weight * offset)[:, None] * across, size)
         least, total = np.linalg.eigvalsh(matrix)[:, 0], np.trace(matrix, axis1=1, axis2=2)
         open_ = least < 1e-9 * np.maximum(total, 1e-300)
         point = np.linalg.solve(matrix + open_[:, None, None] * np.eye(2), right[:, :, None])[

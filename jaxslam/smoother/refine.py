@@ -25,7 +25,7 @@ class Refined(NamedTuple):
 
     `pose` [T, 3], `cov` [T, 3, 3]; `id` [L]: frame * K + k of the measurement that began it; `mean`
     [L, 2] m, `landmark_cov` [L, 3] (xx, xy, yy); `n` [L] measurements used; `identity` [L]: index
-    of the identity, -1 if hidden. `match` [T, K] as `Result.match`. `cost`: nats. `converged`: the
+    of the identity, -1 if hidden. `landmark_id` [T, K] as `Result.landmark_id`. `cost`: nats. `converged`: the
     last solution is at rest and its associations are too. `merged`: landmarks that were another
     one; `dropped`: that had too few measurements or no depth. `residual`: root mean square of the
     inliers' standardised residuals. Covariances are those for the associations made.
@@ -38,7 +38,7 @@ class Refined(NamedTuple):
     landmark_cov: np.ndarray
     n: np.ndarray
     identity: np.ndarray
-    match: np.ndarray
+    landmark_id: np.ndarray
     rounds: int
     iterations: int
     cost: float
@@ -60,26 +60,26 @@ class Solved(NamedTuple):
     converged: bool
 
 
-def refine(frames, pose, birth, start_pose, start_cov, params, sensor, known=False, progress=None):
-    """`Refined` of one lineage: `pose` [T, 3] and `birth` [T, K] (as `filter.Info.birth`).
+def refine(frames, pose, landmark_id, start_pose, start_cov, params, sensor, known=False, progress=None):
+    """`Refined` of one lineage: `pose` [T, 3] and `landmark_id` [T, K] (as `filter.Info.landmark_id`).
 
     `frames`: `frames.Frames` of T frames. `known`: identities say which landmark was measured, and
-    `birth` is not used. `start_cov` [3, 3]: zero (or None) where the start is known. `progress` is
+    `landmark_id` is not used. `start_cov` [3, 3]: zero (or None) where the start is known. `progress` is
     called with (iterations done, cost). Raises `ValueError` for arrays that do not fit.
     """
     shape = np.shape(frames.measurements.valid)
     _check("pose", pose, (shape[0], 3))
-    _check("birth", birth, shape)
+    _check("landmark_id", landmark_id, shape)
     identity = np.asarray(frames.measurements.identity).ravel()
     with jax.enable_x64(True):
-        params = params if known else doubtful(params)
-        given, place = least_squares.problem(frames, start_pose, start_cov, params, sensor)
-        name = identity[place] if known else np.asarray(birth).ravel()[place]
-        found = solved(given, place, pose, name, known, progress=progress)
-    return _refined(found, given, place, shape, identity if known else None)
+        params = params if known else is_doubtful(params)
+        given, place = least_squares.make_problem(frames, start_pose, start_cov, params, sensor)
+        name = identity[place] if known else np.asarray(landmark_id).ravel()[place]
+        found = solve_and_reassociate(given, place, pose, name, known, progress=progress)
+    return _to_refined(found, given, place, shape, identity if known else None)
 
 
-def doubtful(params):
+def is_doubtful(params):
     """The parameters where identities are hidden: a measurement may be of something else, even of a
     sensor that has no clutter."""
     return params._replace(outlier=max(float(params.outlier), MISTAKEN))
@@ -103,7 +103,7 @@ def _groups(name, place, known):
     return reassociation.Groups(group, label, np.full((len(label), 2), np.nan))
 
 
-def _seen_again(groups):
+def _reobserve(groups):
     """`Groups` without those of one measurement, which tell nothing of the path: where much is
     clutter, or the map was full, they are far more than the rest, and matrices of all of them would
     not fit."""
@@ -112,7 +112,7 @@ def _seen_again(groups):
     return reassociation.Groups(number[groups.of], groups.label[again], groups.point[again])
 
 
-def solved(given, place, pose, name, known, again=False, progress=None):
+def solve_and_reassociate(given, place, pose, name, known, again=False, progress=None):
     """Solve and check again until nothing changes: `Solved`.
 
     `place` [M]: of the measurements, as `bundle.problem` has it; `pose` [T, 3]; `name` [M]: their
@@ -122,18 +122,18 @@ def solved(given, place, pose, name, known, again=False, progress=None):
     widths, most = (NARROW, ROUNDS_AGAIN) if again else (WIDE, ROUNDS)
     groups = _groups(name, place, known)
     if not known and len(pose) * len(groups.label) > LARGE:
-        groups = _seen_again(groups)
+        groups = _reobserve(groups)
     path = np.vstack([given.start, pose]).astype(float)
     done, iterations, merged = 0, 0, []
     tries = np.full(len(groups.label), TRIES)
-    groups = _located(given, path, groups, tries)
+    groups = _locate(given, path, groups, tries)
     while True:
-        rows, which = reassociation.inside(groups)
-        fit = least_squares.fit(given, path, groups.point[rows], which, widths, progress)
+        rows, which = reassociation.in_field_of_view(groups)
+        fit = least_squares.solve(given, path, groups.point[rows], which, widths, progress)
         path, done, iterations = fit.path, done + 1, iterations + fit.iterations
         groups.point[rows] = fit.points
-        after, pairs = reassociation.checked(given, fit, groups, known, not again)
-        after = _located(given, path, after, tries)
+        after, pairs = reassociation.check_groups(given, fit, groups, known, not again)
+        after = _locate(given, path, after, tries)
         settled = np.array_equal(after.of, groups.of) and np.array_equal(
             np.isfinite(after.point), np.isfinite(groups.point)
         )
@@ -145,36 +145,36 @@ def solved(given, place, pose, name, known, again=False, progress=None):
         groups = after
 
 
-def _located(given, path, groups, tries):
+def _locate(given, path, groups, tries):
     """`regroup.located` of the groups that still have a try: one whose depth is at the limit would
     come and go for ever. Counts `tries` [G] down."""
-    after = reassociation.located(given, path, groups)
+    after = reassociation.locate(given, path, groups)
     new = np.isfinite(after.point[:, 0]) & ~np.isfinite(groups.point[:, 0])
     tries[new] -= 1
     return after._replace(point=np.where((new & (tries < 0))[:, None], np.nan, after.point))
 
 
-def matches(found, place, shape):
-    """What each measurement was taken for [T, K] (`shape`), as `Result.match`; where the landmark
+def landmark_ids(found, place, shape):
+    """What each measurement was taken for [T, K] (`shape`), as `Result.landmark_id`; where the landmark
     has no depth yet, its label all the same."""
     groups = found.groups
-    _, which = reassociation.inside(groups)
+    _, which = reassociation.in_field_of_view(groups)
     used = (groups.of >= 0) & ((which < 0) | (found.fit.weight > 0.5))
     label = np.where(used, np.append(groups.label, -2)[groups.of], -2)
-    match = np.full(shape, -3).ravel()
-    match[place] = np.where(label == place, -1, label)
-    return match.reshape(shape)
+    landmark_id = np.full(shape, -3).ravel()
+    landmark_id[place] = np.where(label == place, -1, label)
+    return landmark_id.reshape(shape)
 
 
-def _refined(found, given, place, shape, identities):
+def _to_refined(found, given, place, shape, identities):
     """`Refined` from the last round; points without an inlier or a depth are left out."""
     fit, groups = found.fit, found.groups
-    rows, which = reassociation.inside(groups)
+    rows, which = reassociation.in_field_of_view(groups)
     sure = fit.weight > 0.5
     n = np.bincount(which[sure], minlength=len(rows))
     kept = n > 0
     if given.sensor == "bearing":
-        kept &= reassociation.ripe(given, fit, which)
+        kept &= reassociation.is_locatable(given, fit, which)
     cov = fit.factor.points.reshape(len(rows), 2, len(rows), 2)
     every = np.arange(len(rows))
     own = cov[every, :, every][kept]
@@ -191,7 +191,7 @@ def _refined(found, given, place, shape, identities):
         landmark_cov=np.stack([own[:, 0, 0], own[:, 0, 1], own[:, 1, 1]], 1),
         n=n[kept],
         identity=identity[rows][kept],
-        match=matches(found, place, shape),
+        landmark_id=landmark_ids(found, place, shape),
         rounds=found.rounds,
         iterations=found.iterations,
         cost=fit.cost,

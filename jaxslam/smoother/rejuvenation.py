@@ -30,26 +30,26 @@ GROWTH = 0.05  # of the path so far: the least between two rejuvenations of a lo
 SURE = 0.5  # probability above which a measurement is an inlier
 
 
-class Past(NamedTuple):
-    """What all particles share of t frames: `pose` [t, 3] and `birth` [t, K] as refined, in the
+class SharedPast(NamedTuple):
+    """What all particles share of t frames: `pose` [t, 3] and `landmark_id` [t, K] as refined, in the
     frame of the filter; `cov` [t, 3, 3], empty but for the last time. `event` [E, 4]: frames done,
     kind (`events.KINDS`), the landmark's `id`, and what it was merged with (-1)."""
 
     pose: np.ndarray
     cov: np.ndarray
-    birth: np.ndarray
+    landmark_id: np.ndarray
     event: np.ndarray
 
 
-def nothing(slots):
+def empty_past(slots):
     """`Past` of no frames, K measurements wide."""
-    return Past(
+    return SharedPast(
         np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, slots), np.int64),
         np.zeros((0, 4), np.int64),
     )  # fmt: skip
 
 
-def due(odometry, every):
+def due_frames(odometry, every):
     """Numbers of frames done after which it is time: `every` so many metres driven, or a share of
     the path so far; nothing for 0."""
     path = np.cumsum(np.asarray(odometry.distance, float))
@@ -61,17 +61,17 @@ def due(odometry, every):
     return found
 
 
-class Rejuvenation:
+class Rejuvenator:
     """What it takes to give a run's particles a new past: its log, as refinement sees it."""
 
     def __init__(self, data, log, origin, params, config):
-        self.due = frozenset(due(data.odometry, config.rejuvenate))
+        self.due = frozenset(due_frames(data.odometry, config.rejuvenate))
         self._config, self._known = config, config.association == "known"
         self._identity = np.asarray(data.measurements.identity).ravel()
-        params = params if self._known else refine.doubtful(params)
-        if self.due and sharding.leads():
+        params = params if self._known else refine.is_doubtful(params)
+        if self.due and sharding.is_leader():
             with jax.enable_x64(True):
-                self._given, self._place = least_squares.problem(
+                self._given, self._place = least_squares.make_problem(
                     data, log.start_pose - origin, log.start_cov, params, config.sensor
                 )
 
@@ -82,34 +82,34 @@ class Rejuvenation:
         (`filter.settled`), and is given up."""
         young = _young(state, best, self._config)
         joint, lost = (
-            posterior_sampling.nothing(self._config.landmarks)._replace(used=np.int32(0)),
+            posterior_sampling.empty_joint(self._config.landmarks)._replace(used=np.int32(0)),
             0,
         )
-        if sharding.leads():
+        if sharding.is_leader():
             young = jax.tree.map(np.asarray, young)
             try:
                 past, joint, lost = self._looked_back(past, lineage, done, young)
             except np.linalg.LinAlgError:  # a past that can't be refined stays as it is
-                past = nothing(lineage.birth.shape[1]) if past is None else past
+                past = empty_past(lineage.landmark_id.shape[1]) if past is None else past
                 event = np.vstack([past.event, [[done, FAILED, -1, -1]]])
                 past = past._replace(event=event)
-        joint = sharding.told(joint)
+        joint = sharding.broadcast(joint)
         if joint.used == 0:
             return state, past, None
         looks = state.looks
         for leaf in jax.tree.leaves(state._replace(looks=None)):  # no two maps at once
             leaf.delete()
-        return posterior_sampling.drawn(key, joint, done, self._config, looks), past, lost
+        return posterior_sampling.draw_state(key, joint, done, self._config, looks), past, lost
 
     def _looked_back(self, past, lineage, done, young):
         """The new `Past`, `redraw.Joint` and how many landmarks it has no slot for."""
-        past = nothing(lineage.birth.shape[1]) if past is None else past
+        past = empty_past(lineage.landmark_id.shape[1]) if past is None else past
         pose = np.concatenate([past.pose, lineage.pose])
-        birth = np.concatenate([past.birth, lineage.birth])
+        landmark_id = np.concatenate([past.landmark_id, lineage.landmark_id])
         with jax.enable_x64(True):
-            given, place = least_squares.until(self._given, self._place, done)
-            name = self._identity[place] if self._known else birth.ravel()[place]
-            found = refine.solved(given, place, pose, name, self._known, again=True)
+            given, place = least_squares.truncate(self._given, self._place, done)
+            name = self._identity[place] if self._known else landmark_id.ravel()[place]
+            found = refine.solve_and_reassociate(given, place, pose, name, self._known, again=True)
         joint, lost, held = self._joint(found, given, place, young)
         before = _held(past)
         event = [[done, MERGED, a, b] for a, b in found.merged]
@@ -125,22 +125,22 @@ class Rejuvenation:
             if done == max(self.due)
             else past.cov
         )
-        match = refine.matches(found, place, birth.shape)
-        return Past(path, cov, match, np.concatenate([past.event, event])), joint, lost
+        match = refine.landmark_ids(found, place, landmark_id.shape)
+        return SharedPast(path, cov, match, np.concatenate([past.event, event])), joint, lost
 
     def _joint(self, found, given, place, young):
         """`redraw.Joint`, how many landmarks it has no slot for, and labels of those it holds."""
         fit, groups = found.fit, found.groups
-        rows, which = reassociation.inside(groups)
+        rows, which = reassociation.in_field_of_view(groups)
         sure = (which >= 0) & (fit.weight > SURE)
         seen = np.bincount(which[sure], minlength=len(rows))
         slots, lost = self._slots(groups.label[rows], seen, place)
-        joint = posterior_sampling.nothing(self._config.landmarks)
+        joint = posterior_sampling.empty_joint(self._config.landmarks)
         cov = posterior_sampling.covariance(fit)
         kept = np.flatnonzero(slots >= 0)
         index = np.concatenate([np.arange(3), *(3 + 2 * i + np.arange(2) for i in kept)])
         to = np.concatenate([np.arange(3), *(3 + 2 * slots[i] + np.arange(2) for i in kept)])
-        joint.root[to, : len(index)] = posterior_sampling.root_of(cov[np.ix_(index, index)])
+        joint.root[to, : len(index)] = posterior_sampling.factor_of(cov[np.ix_(index, index)])
         joint.pose[:] = fit.path[-1]
         own = np.linalg.cholesky(np.linalg.inv(fit.information))
         sensor = least_squares.sensor_poses(fit.path[given.frame + 1], given.params)[:, :2]
@@ -152,7 +152,7 @@ class Rejuvenation:
             joint.factor[:, s] = own[i][[0, 1, 1], [0, 0, 1]]
             joint.anchor[:, s] = _middle(mine, fit.points[i])
             joint.log_odds[s] = min(max(odds[i], 0), p.existence_max)
-            joint.count[s], joint.birth[s] = seen[i], groups.label[rows[i]]
+            joint.count[s], joint.landmark_id[s] = seen[i], groups.label[rows[i]]
         waiting = np.unique(groups.of[(groups.of >= 0) & (which < 0)])
         # Only bearings leave a depth open.
         waiting = waiting[: len(waiting) if given.sensor == "bearing" else 0]
@@ -175,7 +175,7 @@ class Rejuvenation:
 
     def _carry(self, joint, young, waiting):
         """Take over the best particle's landmarks of unknown depth; how many find no slot."""
-        wanted = (young.landmarks.count > 0) & np.isin(young.landmarks.birth, waiting)
+        wanted = (young.landmarks.count > 0) & np.isin(young.landmarks.landmark_id, waiting)
         free = np.flatnonzero(joint.kind == posterior_sampling.NONE)
         from_ = np.flatnonzero(wanted)
         if self._known:
@@ -188,7 +188,7 @@ class Rejuvenation:
         held = young.landmarks
         joint.kind[to] = posterior_sampling.YOUNG
         joint.mean[:, to], joint.factor[:, to] = held.mean[:, from_], held.factor[:, from_]
-        for name in ("count", "birth", "log_odds"):
+        for name in ("count", "landmark_id", "log_odds"):
             if getattr(held, name) is not None:
                 getattr(joint, name)[to] = getattr(held, name)[from_]
         if held.anchor is not None:
@@ -214,7 +214,7 @@ def _lane(pose, world, best, config):
     found = _Lane(pose[:, best], jax.tree.map(lambda leaf: leaf[..., best], world))
     if config.devices == 1:
         return found
-    everywhere = sharding.shardings(sharding.same(found), config)
+    everywhere = sharding.shardings(sharding.replicated(found), config)
     return jax.lax.with_sharding_constraint(found, everywhere)
 
 

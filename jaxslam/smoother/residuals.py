@@ -35,7 +35,7 @@ def _scale(sensor, pose, point, cov, params):
         xx, xy, yy = (params.position_scale**2 * part for part in cov)
         share = xy / xx
         return 1 / jnp.sqrt(xx), 1 / jnp.sqrt(yy - share * xy), share
-    place = sensors.pose_of(tuple(pose), params)
+    place = sensors.sensor_pose_of(tuple(pose), params)
     seen = sensors.observe("range_bearing", place, tuple(point), None, params)
     along, angle = (1 / jnp.sqrt(jnp.maximum(noise, LEAST_VARIANCE)) for noise in seen.noise)
     zero = jnp.zeros_like(along)
@@ -44,7 +44,7 @@ def _scale(sensor, pose, point, cov, params):
 
 def _innovation(sensor, pose, point, value, scale, params):
     """Whitened innovation of one measurement: [1] of a bearing, else [2]."""
-    place = sensors.pose_of(tuple(pose), params)
+    place = sensors.sensor_pose_of(tuple(pose), params)
     # A point has no depth to be uncertain of: its bearing is that of a range and bearing.
     kind = "position" if sensor == "position" else "range_bearing"
     seen = sensors.observe(kind, place, tuple(point), None, params).value

@@ -9,7 +9,7 @@ import tomllib
 from dataclasses import fields
 from pathlib import Path
 
-from jaxslam.files import replacing
+from jaxslam.files import atomic_write
 from jaxslam.vision.camera import MODELS, Camera, parameter_names
 from jaxslam.vision.foreign_camera_formats import (
     from_kalibr,
@@ -40,7 +40,7 @@ def save_camera(path, camera, kind=None):
         text = writers[kind](camera)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         file.write(text.encode())
 
 

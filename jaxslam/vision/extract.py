@@ -14,7 +14,7 @@ from jaxslam.logs.log import NOT_USED, FloorPlan, Log
 from jaxslam.logs.log_file import save_log
 from jaxslam.logs.odometry import increments
 from jaxslam.logs.readers.csv_files import read_odometry, read_truth
-from jaxslam.logs.readers.text_table import parse, pose_at, read_lines, settle
+from jaxslam.logs.readers.text_table import drop_bad_rows, parse, pose_at, read_lines
 from jaxslam.vision.extraction_journal import Partial
 from jaxslam.vision.image_times import NO_TIME, image_times
 from jaxslam.vision.images import Images, cv2
@@ -279,7 +279,7 @@ def read_plan(path):
     if [cell.strip('"').lower() for cell in lines[0][1]] != PLAN:
         found = ",".join(lines[0][1])[:80]
         raise ValueError(f"{path}, line {lines[0][0]}: header {found!r}; must be {','.join(PLAN)}")
-    table = settle(parse(path, lines[1:], 4, complete, stamped=False), {})
+    table = drop_bad_rows(parse(path, lines[1:], 4, complete, stamped=False), {})
     return FloorPlan(table.value)
 
 

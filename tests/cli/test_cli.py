@@ -245,7 +245,7 @@ def test_advice_is_a_note_and_no_warning(log, call, monkeypatch):
         return dataclasses.replace(make_refined(), dropped={})
 
     monkeypatch.setattr(runner, "run", filtered)
-    monkeypatch.setattr(runner, "refined", lambda result, progress: result)
+    monkeypatch.setattr(runner, "refine_result", lambda result, progress: result)
     code, out, err = call("run", log, "--out", "result")
     assert (code, asked) == (0, [False])  # it refines by itself, with a progress bar of its own
     assert err.startswith("note: all particles share one past ") and err.count("\n") == 1

@@ -12,12 +12,12 @@ from test_association import case, greedy
 
 from jaxslam.config import Config, default_params
 from jaxslam.filter import appearance
-from jaxslam.filter.appearance import learnt
+from jaxslam.filter.appearance import update_appearances
 from jaxslam.filter.association import CLUTTER, NEW, PADDING, associate
-from jaxslam.filter.candidate_slots import concerned, nowhere
-from jaxslam.filter.frames import frames
+from jaxslam.filter.candidate_slots import empty_bounds, select_candidates
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs import diagnostics
-from jaxslam.logs.appearance_space import space
+from jaxslam.logs.appearance_space import fit_appearance_space
 from jaxslam.logs.log_file import save_log
 from jaxslam.models.sensors import Measurements
 from jaxslam.results.run_folder import errors
@@ -60,14 +60,14 @@ def blurred():
 
 
 def test_what_tells_landmarks_apart_is_found_whatever_the_units(room):
-    found = space(room)
+    found = fit_appearance_space(room)
     assert found.coordinates.shape == (len(room.frame), 2) and found.within.shape == (2,)
     np.testing.assert_allclose(found.coordinates.var(0), 1, rtol=0.01)
     np.testing.assert_allclose(found.coordinates.mean(0), 0, atol=0.01)
     # The root of the share that is not the landmark's own.
     share = WITHIN**2 / (1 + WITHIN**2)
     assert (found.within > 0.6 * share**0.5).all() and (found.within < 1.7 * share**0.5).all()
-    other = space(with_columns(room, room.descriptor * [1e-3, -900, 4, 1] + 100))
+    other = fit_appearance_space(with_columns(room, room.descriptor * [1e-3, -900, 4, 1] + 100))
     np.testing.assert_allclose(other.within, found.within, rtol=0.02)
     assert np.abs((other.coordinates * found.coordinates).mean(0)).min() > 0.99
 
@@ -89,20 +89,22 @@ def test_noise_tells_nothing_however_it_comes(room, seed):
         rng.normal(size=(n, 25)),
         noise * 1e-30, noise * 1e30,
     ):  # fmt: skip
-        assert space(with_columns(room, columns)).coordinates.shape == (n, 0)
+        assert fit_appearance_space(with_columns(room, columns)).coordinates.shape == (n, 0)
 
 
 def test_columns_that_repeat_or_add_noise_change_little(room):
-    found, rng = space(room), np.random.default_rng(0)
+    found, rng = fit_appearance_space(room), np.random.default_rng(0)
     columns = room.descriptor
     more = [columns, columns * 3 + 1, columns @ rng.normal(size=(4, 3))]
     more.append(rng.normal(size=(len(columns), 4)))
-    other = space(with_columns(room, np.hstack(more)))
+    other = fit_appearance_space(with_columns(room, np.hstack(more)))
     assert len(other.within) == 2
     np.testing.assert_allclose(other.within, found.within, rtol=0.1)
     outliers = columns.copy()
     outliers[::100, 0] = 1e9
-    np.testing.assert_allclose(space(with_columns(room, outliers)).within, found.within, rtol=0.3)
+    np.testing.assert_allclose(
+        fit_appearance_space(with_columns(room, outliers)).within, found.within, rtol=0.3
+    )
 
 
 def test_without_descriptors_or_links_there_are_no_looks(room):
@@ -110,11 +112,11 @@ def test_without_descriptors_or_links_there_are_no_looks(room):
     assert run.config_for(blind, "bearing").descriptors == 0
     few = {name: getattr(room, name)[:5] for name in ("frame", "bearing", "descriptor")}
     few = dataclasses.replace(room, **few, identity=None, truth=None)
-    assert len(space(few).within) == 0
+    assert len(fit_appearance_space(few).within) == 0
     slow = dataclasses.replace(room, frame_time=room.frame_time[0] + 10**10 * np.arange(
         len(room.frame_time)), odometry_time=room.odometry_time[0] + 10**10 * np.arange(
         len(room.odometry_time)))  # fmt: skip
-    assert len(space(slow).within) == 0  # what was seen long ago is no link
+    assert len(fit_appearance_space(slow).within) == 0  # what was seen long ago is no link
 
 
 def test_hidden_bearings_alone_get_looks_unless_told_otherwise(room):
@@ -122,7 +124,7 @@ def test_hidden_bearings_alone_get_looks_unless_told_otherwise(room):
     assert run.config_for(room, "bearing", descriptors=1).descriptors == 1
     assert run.config_for(planar(length_m=3.0)).descriptors == 0
     with pytest.raises(ValueError, match="3 descriptors are asked for, but 2 tell landmarks"):
-        frames(room, "bearing", descriptors=3)
+        frames_from_log(room, "bearing", descriptors=3)
     with pytest.raises(ValueError, match="identities are known, so looks decide nothing"):
         Config(association="known", descriptors=1)
     with pytest.raises(ValueError, match=r"Config\.descriptors: -1 is not a whole number"):
@@ -146,12 +148,12 @@ def test_the_gain_is_the_predictive_density_over_that_of_any_row(x64):
     rng, within = np.random.default_rng(0), np.array([0.1, 0.4])
     sightings = [rng.normal(size=(n, 2)) for n in (1, 4, 0)]
     seen = rng.normal(size=(3, 2))
-    known = appearance.Looks(
+    known = appearance.Appearances(
         mean=jnp.array([s.mean(0) if len(s) else [5.0, 5.0] for s in sightings]).T,
         weight=jnp.array([float(len(s)) for s in sightings]),
-        birth=jnp.arange(3),
+        landmark_id=jnp.arange(3),
     )
-    found = appearance.gain(known, measured(seen, within))
+    found = appearance.log_likelihood_ratio(known, measured(seen, within))
     for k, d in enumerate(seen):
         for m, before in enumerate(sightings):
             ratio = 0.0
@@ -179,27 +181,31 @@ def test_a_look_is_the_mean_of_its_sightings_and_ends_with_its_landmark(x64):
     for t in range(20):
         match = jnp.array([2, CLUTTER, 0 if t % 2 else 1])
         frame = measured(seen[t], [0.1, 0.1], [True, True, t < 10])
-        known = learnt(known, match, jnp.array([5, CLUTTER, 40 + t % 2]), FULL, t, frame)
+        known = update_appearances(
+            known, match, jnp.array([5, CLUTTER, 40 + t % 2]), FULL, t, frame
+        )
         if t == 3:
             np.testing.assert_allclose(known.mean[:, 2], seen[:4, 0].mean(0))
             np.testing.assert_allclose(known.mean[:, 0], seen[1:4:2, 2].mean(0))
-            assert known.weight.tolist() == [2, 2, 4, 0] and known.birth.tolist() == [41, 40, 5, -1]
+            assert known.weight.tolist() == [2, 2, 4, 0] and known.landmark_id.tolist() == [41, 40, 5, -1]
     assert known.weight.tolist() == [5, 5, appearance.LATEST, 0]  # not by what was not valid
-    other = learnt(known, jnp.array([2, NEW, NEW]), jnp.array([6, NEW, NEW]), FULL, 20, frame)
+    other = update_appearances(
+        known, jnp.array([2, NEW, NEW]), jnp.array([6, NEW, NEW]), FULL, 20, frame
+    )
     np.testing.assert_allclose(other.mean[:, 2], seen[19, 0])
-    assert other.weight[2] == 1 and other.birth[2] == 6
+    assert other.weight[2] == 1 and other.landmark_id[2] == 6
     # What is new has its look from the first: births take the free slots in order.
     frame = measured(seen[0], [0.1, 0.1])
     match, free = jnp.array([NEW, CLUTTER, NEW]), jnp.array([1, 3, 4])
-    born = learnt(known, match, match, free, 30, frame)
+    born = update_appearances(known, match, match, free, 30, frame)
     np.testing.assert_allclose(born.mean[:, [1, 3]].T, seen[0, [0, 2]])
-    assert born.weight[1] == born.weight[3] == 1 and born.birth[jnp.array([1, 3])].tolist() == [
+    assert born.weight[1] == born.weight[3] == 1 and born.landmark_id[jnp.array([1, 3])].tolist() == [
         90,
         92,
     ]
-    gone = appearance.without(known, jnp.array([True, False, True, False]))
+    gone = appearance.clear_slots(known, jnp.array([True, False, True, False]))
     assert gone.weight.tolist() == [0, 5, 0, 0]
-    moved = appearance.moved(known, jnp.array([5, 77, 41, 6]))
+    moved = appearance.reorder_slots(known, jnp.array([5, 77, 41, 6]))
     np.testing.assert_array_equal(moved.mean[:, [0, 2]], known.mean[:, [2, 0]])
     assert moved.weight.tolist() == [appearance.LATEST, 0, 5, 0]
 
@@ -221,16 +227,16 @@ def test_matches_go_by_place_and_looks_together(x64, spread):
 
 def test_a_slot_whose_looks_fit_is_not_passed_over():
     config = Config(landmarks=64, measurements=1, descriptors=1)
-    bounds = nowhere(config, np.float32)
+    bounds = empty_bounds(config, np.float32)
     bounds = bounds._replace(low=bounds.low.at[:, :2].set([[9.0, 9.0], [0, 0]]),
                              high=bounds.high.at[:, :2].set([[9.0, 9.0], [0, 0]]),
                              used=bounds.used.at[:2].set(True))  # fmt: skip
     frame = measured([[0.0]], [0.1])._replace(value=jnp.array([[8.4, 0.0]]))
     params = default_params()._replace(view_range=5.0)
     given = bounds, jnp.zeros((3, 1)), frame
-    assert not concerned(config, *given, None, params, 0.0).any()
+    assert not select_candidates(config, *given, None, params, 0.0).any()
     alike = jnp.zeros((1, 64)).at[0, 1].set(12.0)
-    assert np.flatnonzero(concerned(config, *given, alike, params, 0.0)).tolist() == [1]
+    assert np.flatnonzero(select_candidates(config, *given, alike, params, 0.0)).tolist() == [1]
 
 
 def test_looks_find_lines_that_bearings_alone_confuse(blurred):

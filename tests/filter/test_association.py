@@ -5,7 +5,7 @@ import pytest
 
 from jaxslam.config import Config, default_params
 from jaxslam.filter.association import CLUTTER, NEW, PADDING, _possible, associate
-from jaxslam.filter.landmarks import Scorer, score
+from jaxslam.filter.landmarks import Scorer, log_likelihoods
 from jaxslam.models.sensors import Measurements
 
 K, M, N = 5, 7, 300
@@ -128,7 +128,7 @@ def test_slots_that_are_passed_over_could_not_have_matched(x64, seed, scatter):
     params, threshold = default_params(), jnp.full(k, -1.0)
     match, _ = associate(config, scorer, measurements, threshold, -9.0, params)
     columns = tuple(jnp.asarray(value[:, i, None, None]) for i in range(2))
-    table = np.asarray(score("range_bearing", scorer, columns, None, params))
+    table = np.asarray(log_likelihoods("range_bearing", scorer, columns, None, params))
     expected = np.where(table.max(1) > -1, table.argmax(1), NEW)
     np.testing.assert_array_equal(match, expected)
     possible = _possible(config, scorer, measurements, threshold)

@@ -114,7 +114,7 @@ def test_evidence_and_means_against_a_joint_kalman_filter(x64, threshold, propos
         start_key, key = jax.random.split(key)
         state = fastslam.init(config, start_key, START, START_COV)
         state, info = fastslam.run(key, state, *data, config)
-        state = fastslam.settled(state, config)
+        state = fastslam.settle(state, config)
         weight = jnp.exp(state.log_weight)
         mean = jnp.concatenate([state.pose[:2] @ weight, (state.landmarks.mean @ weight).T.ravel()])
         return info.log_evidence.sum(), mean, info.resampled.sum()

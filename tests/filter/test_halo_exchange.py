@@ -50,7 +50,7 @@ def test_borders_are_enough_where_they_are():
     for amount in np.repeat(np.arange(-11, 12), 20):
         index = np.arange(N) + amount + rng.integers(-2, 3, N)
         index = np.sort(np.clip(index, 0, N - 1)).astype("i")
-        assert bool(halo_exchange.enough(index, config)) == needed(index)
+        assert bool(halo_exchange.suffices(index, config)) == needed(index)
         found.append(needed(index))
     assert 20 < sum(found) < len(found) - 20
 

@@ -51,9 +51,9 @@ def test_score_is_the_updates_log_density(x64, sensor):
     """Of a bearing it is one normal's, to second order: the baseline's."""
     world = world_of(sensor, [[1, 0, 3], [2, 1, 0]])
     seen = sensors.observe(sensor, poses(3), tuple(world.mean), anchors(world), PARAMS)
-    scorer = landmarks.scorer(sensor, seen, world, np.log(0.9))
+    scorer = landmarks.make_scorer(sensor, seen, world, np.log(0.9))
     value = (2.5, 0.4)
-    got = landmarks.score(sensor, scorer, value, COV, PARAMS)
+    got = landmarks.log_likelihoods(sensor, scorer, value, COV, PARAMS)
     for m in range(2):
         for n in range(3):
             anchor = None if world.anchor is None else world.anchor[:, m, n]
@@ -78,7 +78,9 @@ def test_matched_landmarks_are_updated_marked_and_weighed(x64, sensor):
     # The last two measurements share a landmark in the second particle.
     match = jnp.array([[1, -1], [-2, 2], [0, 2], [-3, -3]])
     frame = frame_of(sensor, world, match)
-    got, density = landmark_updates.updated(sensor, poses(2), world, match, frame, PARAMS, True)
+    got, density = landmark_updates.update_matched(
+        sensor, poses(2), world, match, frame, PARAMS, True
+    )
     for n in range(2):
         total = 0.0
         mean, factor = np.array(world.mean[:, :, n]), np.array(world.factor[:, :, n])
@@ -97,7 +99,7 @@ def test_matched_landmarks_are_updated_marked_and_weighed(x64, sensor):
         np.testing.assert_array_equal(got.count[:, n], count)
         assert float(density[n]) == pytest.approx(total, abs=1e-9)
     np.testing.assert_array_equal(got.count, [[-2, 0], [-3, 5], [4, -3]])
-    for name in ("birth", "log_odds"):
+    for name in ("landmark_id", "log_odds"):
         np.testing.assert_array_equal(getattr(got, name), getattr(world, name))
 
 
@@ -108,15 +110,17 @@ def test_rows_of_known_identities_are_updated_as_the_map_is(x64, sensor):
     match = jnp.array([[1, -1], [1, 1], [0, -2], [-3, -3], [-1, -1], [1, 1]])
     identity = jnp.array([1, 1, 0, 2, 7, 1])
     frame = frame_of(sensor, world, match)._replace(identity=identity)
-    rows = landmark_updates.rows_of(frame, 3)
+    rows = landmark_updates.known_slots(frame, 3)
     np.testing.assert_array_equal(rows.slot, [1, 1, 0, 3, 3, 1])
     np.testing.assert_array_equal(rows.earlier, [0, 1, 0, 0, 0, 2])
     part = jax.tree.map(lambda leaf: leaf[..., jnp.minimum(rows.slot, 2), :], world)
-    fit = landmark_updates.fitted(sensor, poses(2), part, frame, PARAMS)
+    fit = landmark_updates.fit_known(sensor, poses(2), part, frame, PARAMS)
     given = rows, match, frame, PARAMS
-    got, density = landmark_updates.updated_rows(sensor, poses(2), part, *given, fit)
-    whole, expected = landmark_updates.updated(sensor, poses(2), world, match, frame, PARAMS, True)
-    whole = landmarks.settle(whole)
+    got, density = landmark_updates.update_known(sensor, poses(2), part, *given, fit)
+    whole, expected = landmark_updates.update_matched(
+        sensor, poses(2), world, match, frame, PARAMS, True
+    )
+    whole = landmarks.unmark_matched(whole)
     for k, slot in ((0, 1), (2, 0)):
         for name in ("mean", "factor", "count"):
             row = getattr(got, name)[..., k, :]
@@ -148,12 +152,12 @@ def test_births_take_slots_that_no_particle_uses_in_the_measurements_order(x64, 
         )
         np.testing.assert_allclose(got.mean[:, slot, lane], mean, atol=1e-12)
         np.testing.assert_allclose(got.factor[:, slot, lane], factor, atol=1e-12)
-        assert int(got.birth[slot, lane]) == 10 * 4 + k
+        assert int(got.landmark_id[slot, lane]) == 10 * 4 + k
         assert float(got.log_odds[slot, lane]) == pytest.approx(PARAMS.existence_new)
         if sensor == "bearing":
             np.testing.assert_allclose(got.anchor[:, slot, lane], anchor)
     kept = np.array([[1, 1, 1], [0, 0, 0], [1, 1, 1], [1, 1, 1], [0, 1, 0]], bool)
-    for name in ("mean", "factor", "log_odds", "birth"):
+    for name in ("mean", "factor", "log_odds", "landmark_id"):
         old, new = (np.asarray(getattr(w, name))[..., kept] for w in (world, got))
         np.testing.assert_array_equal(new, old)
 
@@ -181,8 +185,8 @@ def test_known_identities_go_to_their_slot(x64):
     np.testing.assert_array_equal(got.count, [[1, 1], [0, 0], [1, 1]])
     np.testing.assert_array_equal(lost, [1, 1])  # identity 5 has no slot
     np.testing.assert_array_equal(touched, [True, False, True])
-    np.testing.assert_array_equal(got.birth[2], [4, 4])
-    assert int(got.birth[0, 1]) == 5
+    np.testing.assert_array_equal(got.landmark_id[2], [4, 4])
+    assert int(got.landmark_id[0, 1]) == 5
     assert got.log_odds is None
     np.testing.assert_array_equal(got.mean[:, 0, 0], world.mean[:, 0, 0])
 
@@ -212,8 +216,8 @@ def test_existence_by_hand(x64):
     ]
     count, log_odds, r, bearing, want_odds, want_count = map(np.array, zip(*rows, strict=True))
     world = world_of("range_bearing", count[:, None])._replace(log_odds=log_odds[:, None])
-    seen = sensors.Seen((), (), (), r[:, None], bearing[:, None])
-    got, freed = landmarks.existence(world, seen, params)
+    seen = sensors.Prediction((), (), (), r[:, None], bearing[:, None])
+    got, freed = landmarks.update_existence(world, seen, params)
     np.testing.assert_allclose(got.log_odds[:, 0], want_odds, atol=1e-12)
     np.testing.assert_array_equal(got.count[:, 0], want_count)
     np.testing.assert_array_equal(freed, [1])
@@ -222,15 +226,15 @@ def test_existence_by_hand(x64):
 def test_existence_frees_each_particles_own(x64):
     world = world_of("range_bearing", [[1, 1], [1, 1]])
     world = world._replace(log_odds=jnp.array([[1e-3, 1e-3], [1e-3, 5.0]]))
-    near = sensors.Seen((), (), (), jnp.ones((2, 2)), jnp.zeros((2, 2)))
-    got, freed = landmarks.existence(world, near, PARAMS)
+    near = sensors.Prediction((), (), (), jnp.ones((2, 2)), jnp.zeros((2, 2)))
+    got, freed = landmarks.update_existence(world, near, PARAMS)
     np.testing.assert_array_equal(freed, [2, 1])
     np.testing.assert_array_equal(got.count, [[0, 0], [0, 1]])
 
 
 def test_settle_takes_the_marks_off(x64):
     world = world_of("range_bearing", [[-3, 0], [2, -1]])
-    got = landmarks.settle(world)
+    got = landmarks.unmark_matched(world)
     np.testing.assert_array_equal(got.count, [[3, 0], [2, 1]])
     np.testing.assert_array_equal(got.mean, world.mean)
 
@@ -241,13 +245,13 @@ def test_a_given_map_fills_the_first_slots_of_every_particle(x64, sensor):
     rng = np.random.default_rng(0)
     given = rng.normal(size=(2, 2)), rng.uniform(0.1, 1, (3, 2)), rng.normal(size=(2, 2))
     given = given if sensor == "bearing" else given[:2]
-    world = new_landmarks.given(landmarks.empty(config, jnp.zeros(()).dtype), given)
+    world = new_landmarks.place_given(landmarks.empty(config, jnp.zeros(()).dtype), given)
     for n in range(3):
         np.testing.assert_array_equal(world.mean[:, :2, n], given[0])
         np.testing.assert_array_equal(world.factor[:, :2, n], given[1])
         np.testing.assert_array_equal(world.count[:, n], [1, 1, 0, 0])
         # No birth of a frame, nor NEW, CLUTTER or PADDING.
-        np.testing.assert_array_equal(world.birth[:2, n], [-4, -5])
+        np.testing.assert_array_equal(world.landmark_id[:2, n], [-4, -5])
         if sensor == "bearing":
             np.testing.assert_array_equal(world.anchor[:, :2, n], given[2])
     np.testing.assert_array_equal(world.mean[:, 2:], 0)
@@ -256,7 +260,7 @@ def test_a_given_map_fills_the_first_slots_of_every_particle(x64, sensor):
 def test_a_given_map_must_fit():
     world = landmarks.empty(Config(particles=2, landmarks=1), jnp.float32)
     with pytest.raises(ValueError, match="2 landmarks given, but the map has 1 slots"):
-        new_landmarks.given(world, (np.zeros((2, 2)), np.ones((3, 2))))
+        new_landmarks.place_given(world, (np.zeros((2, 2)), np.ones((3, 2))))
 
 
 @pytest.mark.parametrize("sensor", SENSORS)

@@ -11,9 +11,9 @@ import pytest
 from jaxslam.config import Config, Params, default_params
 from jaxslam.filter import candidate_slots, lazy_resampling
 from jaxslam.filter import step as fastslam
-from jaxslam.filter.frames import frames
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.filter.landmarks import Landmarks
-from jaxslam.filter.xla import listed
+from jaxslam.filter.xla import nonzero_indices
 from jaxslam.simulation.planar import planar
 
 PARTICLES, SLOTS = 64, 48
@@ -24,7 +24,7 @@ PARTICLES, SLOTS = 64, 48
 def test_listed_is_nonzero(length, share):
     mask = np.random.default_rng(length).uniform(size=length) < share
     for size in (None, 5):
-        index, count = listed(jnp.asarray(mask), size)
+        index, count = nonzero_indices(jnp.asarray(mask), size)
         assert count == mask.sum()
         expected = np.full(length if size is None else size, length)
         found = np.flatnonzero(mask)[: len(expected)]
@@ -42,14 +42,14 @@ def test_chains_give_what_copying_at_once_gives():
         anchor=None,
         log_odds=None,
         count=jnp.asarray(rng.integers(0, 9, (12, PARTICLES)), jnp.int32),
-        birth=jnp.asarray(rng.integers(0, 9, (12, PARTICLES)), jnp.int32),
+        landmark_id=jnp.asarray(rng.integers(0, 9, (12, PARTICLES)), jnp.int32),
     )
-    past, plain = lazy_resampling.new(config), jax.tree.map(np.array, world)
-    update = jax.jit(partial(lazy_resampling.update, config=config))
-    resampled = jax.jit(lazy_resampling.resampled)
+    past, plain = lazy_resampling.empty_ancestry(config), jax.tree.map(np.array, world)
+    update = jax.jit(partial(lazy_resampling.apply_ancestry, config=config))
+    resampled = jax.jit(lazy_resampling.compose)
     stale = 0
     for _ in range(60):
-        looked = jnp.asarray(rng.uniform(size=12) < 0.2) | lazy_resampling.last_of(past)
+        looked = jnp.asarray(rng.uniform(size=12) < 0.2) | lazy_resampling.oldest_slots(past)
         world, past = update(world, past, looked)
         for slot in np.flatnonzero(looked):
             change = rng.normal(size=PARTICLES).astype("f")
@@ -69,7 +69,9 @@ def test_chains_give_what_copying_at_once_gives():
 def driven(config, log):
     """Final settled state and every step's `Info`."""
     params = default_params(config.sensor, log)
-    data = frames(log, config.sensor, config.measurements, params, config.association == "known")
+    data = frames_from_log(
+        log, config.sensor, config.measurements, params, config.association == "known"
+    )
     numbers = jax.tree.map(
         lambda v: jnp.asarray(v, jnp.float32) if np.asarray(v).dtype.kind == "f" else v,
         (data.odometry, data.measurements, Params(*map(np.asarray, params))),
@@ -77,7 +79,7 @@ def driven(config, log):
     key = jax.random.key(3)
     state = fastslam.init(config, key, log.start_pose, log.start_cov)
     state, info = fastslam.run(key, state, *numbers, config)
-    return fastslam.settled(state, config), info
+    return fastslam.settle(state, config), info
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +103,7 @@ def test_laziness_does_not_change_a_bit(log, sensor, association):
     there = state.landmarks.count > 0
     for change in ({"lazy": False}, {"chains": 2}):
         other, same = driven(dataclasses.replace(base, **change), log)
-        for name in ("pose", "log_evidence", "ancestors", "birth", "overflow", "forgotten"):
+        for name in ("pose", "log_evidence", "ancestors", "landmark_id", "overflow", "forgotten"):
             mine, theirs = getattr(info, name), getattr(same, name)
             np.testing.assert_array_equal(theirs, mine, f"{change}: {name}")
         for mine, theirs in zip(*map(jax.tree.leaves, (state, other)), strict=False):
@@ -130,7 +132,7 @@ def test_slots_passed_over_change_nothing(monkeypatch, sensor, association):
             log, point=point, point_cov=np.tile([0.01, 0.0, 0.01], (len(point), 1))
         )
     config = Config(sensor=sensor, association=association, particles=PARTICLES, landmarks=100)
-    concerned, seen = candidate_slots.concerned, []
+    concerned, seen = candidate_slots.select_candidates, []
 
     def watched(config, bounds, *rest):
         rows = concerned(config, bounds, *rest)
@@ -140,18 +142,18 @@ def test_slots_passed_over_change_nothing(monkeypatch, sensor, association):
         return rows
 
     jax.clear_caches()
-    monkeypatch.setattr(candidate_slots, "concerned", watched)
+    monkeypatch.setattr(candidate_slots, "select_candidates", watched)
     state, info = driven(config, log)
     jax.effects_barrier()
     monkeypatch.setattr(
-        candidate_slots, "concerned", lambda config, bounds, *_: jnp.ones_like(bounds.used)
+        candidate_slots, "select_candidates", lambda config, bounds, *_: jnp.ones_like(bounds.used)
     )
     jax.clear_caches()
     other, same = driven(config, log)
     # A frame of fewer slots is another program, which may round differently.
     np.testing.assert_allclose(same.pose, info.pose, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(same.log_evidence, info.log_evidence, rtol=1e-5, atol=1e-5)
-    for name in ("ancestors", "birth"):
+    for name in ("ancestors", "landmark_id"):
         np.testing.assert_array_equal(getattr(same, name), getattr(info, name))
     for mine, theirs in zip(
         *(map(jnp.sort, w.landmarks.count.T) for w in (state, other)), strict=True
@@ -165,7 +167,7 @@ def test_bounds_hold_for_every_particle(log):
     """Of every slot with a landmark in some particle, at the end of a run."""
     config = Config(particles=PARTICLES, landmarks=SLOTS)
     state, _ = driven(config, log)
-    bounds, exact = state.bounds, candidate_slots.of_rows(state.landmarks)
+    bounds, exact = state.bounds, candidate_slots.bounds_of(state.landmarks)
     assert (bounds.used | ~exact.used).all() and exact.used.sum() > 5
     assert (bounds.low <= exact.low).all() and (bounds.high >= exact.high).all()
     assert (bounds.spread >= exact.spread * (1 - 1e-6)).all()  # worked out by another program

@@ -38,11 +38,11 @@ def test_points_in_the_world_are_what_they_are(x64, sensor):
     assert known.all()
 
 
-def brute_force(sensor, world, weight, birth):
+def brute_force(sensor, world, weight, landmark_id):
     """Mean and covariance of the mixture of all particles' landmarks of this birth."""
     point, cov, known = (np.asarray(v) for v in map_estimate.to_world(sensor, world))
     shares, means, covs = [], [], []
-    for m, n in np.argwhere(np.asarray(world.birth) == birth):
+    for m, n in np.argwhere(np.asarray(world.landmark_id) == landmark_id):
         if world.count[m, n] > 0 and known[m, n]:
             shares.append(weight[n])
             means.append(point[:, m, n])
@@ -61,19 +61,19 @@ def test_the_summary_is_the_mixture_over_the_particles(x64, sensor):
     count[:, best] = [2, 1, 0, 3, 1]
     world = world_of(sensor, count)
     # The same births, in each particle in other slots; some in none, some emptied.
-    birth = np.array([rng.permutation([3, 14, 15, 92, 65]) for _ in range(particles)]).T
+    landmark_id = np.array([rng.permutation([3, 14, 15, 92, 65]) for _ in range(particles)]).T
     log_odds = np.full(count.shape, 9.0)
     log_odds[3, best] = 4.9  # not confirmed yet
     factor = np.array(world.factor)
     if sensor == "bearing":
         factor[2, 4, best] = 5.0  # of unknown depth
         factor[2, 0, 0] = 5.0  # and one that another particle must not average in
-        birth[[0, *np.flatnonzero(birth[:, 0] == birth[0, best])], 0] = birth[
-            [*np.flatnonzero(birth[:, 0] == birth[0, best]), 0], 0
+        landmark_id[[0, *np.flatnonzero(landmark_id[:, 0] == landmark_id[0, best])], 0] = landmark_id[
+            [*np.flatnonzero(landmark_id[:, 0] == landmark_id[0, best]), 0], 0
         ]
         count[0, 0] = 2
     world = world._replace(
-        birth=jnp.asarray(birth),
+        landmark_id=jnp.asarray(landmark_id),
         log_odds=jnp.asarray(log_odds),
         factor=jnp.asarray(factor),
         count=jnp.asarray(count),
@@ -83,10 +83,10 @@ def test_the_summary_is_the_mixture_over_the_particles(x64, sensor):
     table = map_estimate.summarise(world, jnp.asarray(weight), best, PARAMS, config)
     ripe = sensor != "bearing"
     np.testing.assert_array_equal(table.kept, [True, True, False, False, ripe])
-    np.testing.assert_array_equal(table.birth, birth[:, best])
+    np.testing.assert_array_equal(table.landmark_id, landmark_id[:, best])
     np.testing.assert_array_equal(table.count, count[:, best])
     for m in np.flatnonzero(table.kept):
-        mean, cov = brute_force(sensor, world, weight, birth[m, best])
+        mean, cov = brute_force(sensor, world, weight, landmark_id[m, best])
         np.testing.assert_allclose(table.mean[:, m], mean, atol=1e-10)
         np.testing.assert_allclose(matrix(table.cov[:, m]), cov, atol=1e-10)
 

@@ -31,13 +31,13 @@ def test_rows_are_the_derivatives_by_the_motions_normals(x64, sensor):
         return motion.sample(before, ODOMETRY, params, u)
 
     def predicted(u):
-        sensor_pose = sensors.pose_of(pose_of(u), params)
+        sensor_pose = sensors.sensor_pose_of(pose_of(u), params)
         return jnp.stack(sensors.observe(sensor, sensor_pose, mean, anchor, params).value)
 
     zero = jnp.zeros(3)
-    sensor_pose = sensors.pose_of(pose_of(zero), params)
-    axes = proposal.axes(before, pose_of(zero), sensor_pose, ODOMETRY, params)
-    found = proposal.rows(sensor, sensor_pose, axes, mean, anchor, predicted(zero))
+    sensor_pose = sensors.sensor_pose_of(pose_of(zero), params)
+    axes = proposal.motion_axes(before, pose_of(zero), sensor_pose, ODOMETRY, params)
+    found = proposal.pose_jacobian(sensor, sensor_pose, axes, mean, anchor, predicted(zero))
     np.testing.assert_allclose(np.array(found), jax.jacobian(predicted)(zero), atol=1e-12)
 
 

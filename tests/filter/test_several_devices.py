@@ -17,7 +17,7 @@ from jaxslam.cli import main as cli
 from jaxslam.config import Config, default_params
 from jaxslam.logs.log_file import save_log
 from jaxslam.runs import checkpoints, cluster
-from jaxslam.runs.cluster import Place
+from jaxslam.runs.cluster import ClusterAddress
 from jaxslam.simulation.planar import planar
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -196,7 +196,7 @@ def meeting(*parties, limit=20.0):
 
     def one(index, place, run):
         try:
-            found[index] = cluster.meet(place, run, limit)
+            found[index] = cluster.rendezvous(place, run, limit)
         except ConnectionError as error:
             found[index] = str(error)
 
@@ -213,11 +213,11 @@ def meeting(*parties, limit=20.0):
 
 def test_all_meet_and_whoever_does_not_fit_is_named_on_every_side():
     port, run = free_port(), {"seed": 1, "config": {"particles": 10}, "log": "a"}
-    places = [Place("127.0.0.1", port, 3, i) for i in range(3)]
+    places = [ClusterAddress("127.0.0.1", port, 3, i) for i in range(3)]
     first, second, third = meeting(*((place, run) for place in places))
     assert (sorted(first), sorted(second), sorted(third)) == ([1, 2], [0], [0])
 
-    pair = [Place("127.0.0.1", port, 2, i) for i in range(2)]
+    pair = [ClusterAddress("127.0.0.1", port, 2, i) for i in range(2)]
     other = {"seed": 2, "config": {"particles": 20}, "log": "b"}
     said = meeting((pair[0], run), (pair[1], other))
     differing = "seed (1, now 2), particles (10, now 20), log"
@@ -231,7 +231,7 @@ def test_all_meet_and_whoever_does_not_fit_is_named_on_every_side():
 
 def test_whoever_is_missing_is_named(monkeypatch):
     port = free_port()
-    lead, other = (Place("127.0.0.1", port, 2, i) for i in range(2))
+    lead, other = (ClusterAddress("127.0.0.1", port, 2, i) for i in range(2))
     told = f"process 1 did not come to 127.0.0.1:{port} within 0.5 s"
     assert meeting((lead, {}), limit=0.5) == [told]
     (said,) = meeting((other, {}), limit=0.5)
@@ -242,7 +242,7 @@ def test_whoever_is_missing_is_named(monkeypatch):
 
 
 def test_a_missing_process_ends_the_command_with_69(at, short, call, monkeypatch):
-    monkeypatch.setattr(cluster.meet, "__defaults__", (0.5,))
+    monkeypatch.setattr(cluster.rendezvous, "__defaults__", (0.5,))
     words = "run", short, "--num-processes", 2, "--coordinator", f"127.0.0.1:{free_port()}"
     code, out, err = call(*words, "--process-id", 0)
     assert (code, out, err.count("\n")) == (69, "", 1)
@@ -268,7 +268,7 @@ def test_options_that_do_not_fit_are_refused(at, short, refuse):
     assert cli.main([*map(str, run), "--devices", "0"]) == 2
     for address in ("localhost", ":80", "a b:1", "h:0", "h:65536", "h:x", "::1:80"):
         with pytest.raises(ValueError, match="must be HOST:PORT, like 127"):
-            cluster.place(address, 2, 1, {})
+            cluster.find_address(address, 2, 1, {})
     assert os.listdir() == []
 
 
@@ -290,20 +290,24 @@ MPI = {"OMPI_COMM_WORLD_SIZE": "2", "OMPI_COMM_WORLD_RANK": "1"}
     ],
 )
 def test_launchers_say_where_all_meet(env, found):
-    assert cluster.place(env=env) == (found and Place(*found))
+    assert cluster.find_address(env=env) == (found and ClusterAddress(*found))
 
 
 def test_options_go_before_the_launcher():
-    place = cluster.place("[::1]:80", env=MPI)
-    assert place == Place("::1", 80, 2, 1) and place.address == "[::1]:80"
+    place = cluster.find_address("[::1]:80", env=MPI)
+    assert place == ClusterAddress("::1", 80, 2, 1) and place.address == "[::1]:80"
     with pytest.raises(ValueError, match="--coordinator missing; "):
-        cluster.place(env=MPI)
+        cluster.find_address(env=MPI)
     # A launcher's processes with a run each.
-    assert cluster.place(processes=1, env=MPI) is cluster.place(processes=1, env=SLURM) is None
+    assert (
+        cluster.find_address(processes=1, env=MPI)
+        is cluster.find_address(processes=1, env=SLURM)
+        is None
+    )
 
 
 def test_a_run_is_the_same_whoever_shares_it():
-    one, two = (checkpoints._numbers(Config(devices=d), default_params(), 0) for d in (1, 2))
+    one, two = (checkpoints._settings(Config(devices=d), default_params(), 0) for d in (1, 2))
     assert one == two
 
 
@@ -311,5 +315,5 @@ def test_a_setting_that_an_earlier_version_did_not_have_counts_as_its_default():
     """A run of that version, put aside, is no run with looks; it is gone on with without."""
     before = {"config": {"particles": 20}}
     with_looks, without = ({"config": {"particles": 20, "descriptors": n}} for n in (6, 0))
-    assert cluster.differences(before, with_looks) == "descriptors (0, now 6)"
-    assert cluster.differences(before, without) == ""
+    assert cluster.find_differences(before, with_looks) == "descriptors (0, now 6)"
+    assert cluster.find_differences(before, without) == ""

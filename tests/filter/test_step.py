@@ -11,7 +11,7 @@ import pytest
 from jaxslam.config import SENSORS, Config, default_params
 from jaxslam.filter import association
 from jaxslam.filter import step as fastslam
-from jaxslam.filter.frames import frames
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.models import motion
 from jaxslam.results.metrics import ate
 from jaxslam.runs.run import config_for, run
@@ -29,7 +29,7 @@ def log():
 def setup(log, sensor="range_bearing", **settings):
     config = config_for(log, sensor, particles=PARTICLES, landmarks=30, block=8, **settings)
     params = default_params(sensor, log)
-    data = frames(log, sensor, config.measurements, params, config.association == "known")
+    data = frames_from_log(log, sensor, config.measurements, params, config.association == "known")
     real = jnp.zeros(()).dtype
     data = jax.tree.map(
         lambda leaf: jnp.asarray(
@@ -42,7 +42,7 @@ def setup(log, sensor="range_bearing", **settings):
 
 def chances(config, steps=STEPS):
     key = jax.random.key(0)
-    return jax.vmap(lambda i: fastslam.draws(key, i, config))(jnp.arange(steps))
+    return jax.vmap(lambda i: fastslam.draw_random_numbers(key, i, config))(jnp.arange(steps))
 
 
 @partial(jax.jit, static_argnames="config")

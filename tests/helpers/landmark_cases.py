@@ -66,5 +66,5 @@ def world_of(sensor, count, seed=0, forgetting=True):
         anchor=stack(2) if sensor == "bearing" else None,
         log_odds=jnp.full(count.shape, 2.0) if forgetting else None,
         count=jnp.asarray(count, jnp.int32),
-        birth=jnp.asarray(rng.integers(0, 100, count.shape), jnp.int32),
+        landmark_id=jnp.asarray(rng.integers(0, 100, count.shape), jnp.int32),
     )

@@ -45,9 +45,9 @@ def make_result(frames=40, truth=True, shift=0.1):
     reckoning = pose + np.linspace(0, 1, frames)[:, None] * [0.5, 0.5, 0.1]
     row = np.full((frames, 3), -1)
     row[:, :2] = np.arange(2 * frames).reshape(-1, 2)
-    match = np.full((frames, 3), -3)
-    match[:, 1] = -2
-    match[:, 0] = np.where(np.arange(frames) < 4, -1, np.arange(frames) % 4 * 3)
+    landmark_id = np.full((frames, 3), -3)
+    landmark_id[:, 1] = -2
+    landmark_id[:, 0] = np.where(np.arange(frames) < 4, -1, np.arange(frames) % 4 * 3)
     marks = np.vstack([LANDMARKS + np.array([shift, 0]), [[30.0, 30.0]]])
     zero = np.zeros(frames)
     return Result(
@@ -67,7 +67,7 @@ def make_result(frames=40, truth=True, shift=0.1):
         log_evidence=zero - 1.5,
         nonfinite=zero.astype(int),
         degenerate=zero > 0,
-        match=match,
+        landmark_id=landmark_id,
         row=row,
         landmarks=MapEstimate(
             id=np.array([0, 3, 6, 9, 50]),
@@ -92,7 +92,7 @@ def make_refined(frames=40, truth=True, shift=0.1):
     return dataclasses.replace(
         result,
         ancestral=Ancestral(result.pose - 0.2 * back, result.cov / 2, np.arange(frames) // 10 + 1),
-        lineage=Lineage(result.pose - 0.3 * back, result.match),
+        lineage=Lineage(result.pose - 0.3 * back, result.landmark_id),
         refined=Refined(
             pose=result.pose - 0.5 * back,
             cov=result.cov / 4,
@@ -101,7 +101,7 @@ def make_refined(frames=40, truth=True, shift=0.1):
             landmark_cov=world.cov[few] / 4,
             n=world.n[few],
             identity=world.identity[few],
-            match=np.where(np.arange(frames)[:, None] == 8, -2, result.match),
+            landmark_id=np.where(np.arange(frames)[:, None] == 8, -2, result.landmark_id),
             rounds=3,
             iterations=20,
             cost=-12.5,

@@ -52,7 +52,7 @@ def test_the_free_scale_there_and_back(x64, name):
 
 def test_what_starts_at_zero_has_no_logarithm(start):
     with pytest.raises(ValueError, match="growth is 0: to be learnt it must start above 0"):
-        transforms.taken(start, ("growth",))
+        transforms.free_vector(start, ("growth",))
 
 
 def test_the_usual_choice_leaves_the_scale_to_the_odometry_when_there_are_bearings_only():
@@ -178,7 +178,7 @@ def test_a_landmark_held_twice_gains_nothing_where_association_is_even(x64, even
 
 def test_density_of_new_landmarks_has_a_finite_best_value(logs, start):
     """The score by it is the number of new landmarks over it, less the frames' area."""
-    data = likelihood.data_of(logs[0], CONFIG, start)
+    data = likelihood.data_from_log(logs[0], CONFIG, start)
     found = likelihood.score(start, data, jax.random.key(0), CONFIG, ("density_new",))
     seen = len(np.unique(logs[0].identity))
     frames, area = len(logs[0].frame_time), np.pi * start.view_range**2

@@ -80,7 +80,7 @@ def test_the_table_names_everything_and_no_error_that_means_nothing():
 
 def test_the_sentences():
     judged = Judged(np.array([-10.0, -12.0]), np.array([-5.0, -5.0]))
-    text = "\n".join(learn_report.sentences(make_fit(), make_errors(), judged))
+    text = "\n".join(learn_report.describe(make_fit(), make_errors(), judged))
     assert "all steps done (20 steps, 12 s)" in text
     assert "-11.00 ± 1.41 before, -5.00 ± 0.00 after, difference +6.00 ± 1.41 nats (2 fresh" in text
     assert "standard errors: products of the scores and their slope agree" in text
@@ -91,7 +91,7 @@ def test_the_sentences():
     assert "at most (sigma_bearing)" in text
     assert "discount 1 instead of 0.97 would move the estimate by 0 standard errors" in text
     assert text.endswith("not resolved: mount_yaw (the log does not tell)")
-    assert "held-out" not in "\n".join(learn_report.sentences(make_fit(), make_errors()))
+    assert "held-out" not in "\n".join(learn_report.describe(make_fit(), make_errors()))
 
 
 def test_nothing_wrong_no_warning():

@@ -21,7 +21,7 @@ KEY = jax.random.key(4)
 
 FAST = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # compiling
 forward = jax.jit(
-    likelihood.scored.__wrapped__,
+    likelihood.score_and_value.__wrapped__,
     static_argnames=("config", "names", "estimator"),
     compiler_options=FAST,
 )
@@ -83,7 +83,7 @@ def backwards(params, data, config, names, discount):
 
         def step(carry, frame):
             state, inherited = carry
-            chance = likelihood.draws(key, state.step, config)
+            chance = likelihood.draw_for_frame(key, state.step, config)
             seen = blocks.observe(state, chance, *frame, given, config, True)
             drawn = motion.log_density(hold(seen.pose), hold(state.pose), frame[0], given)
             own = discount * inherited + seen.density + drawn
@@ -145,7 +145,7 @@ def scored():
     """A small problem, what can be learnt, and its `Score`."""
     with jax.enable_x64(True):
         log, params, config = small()
-        names, data = likelihood.learnable(config), likelihood.data_of(log, config)
+        names, data = likelihood.learnable(config), likelihood.data_from_log(log, config)
         return log, params, config, names, forward(numbers(params), data, KEY, config, names)
 
 
@@ -188,7 +188,7 @@ def test_grad_by_one_parameter(x64, scored, name):
 
 def test_plain_is_what_differentiation_of_the_value_gives(x64, scored, monkeypatch):
     log, params, config, *_ = scored
-    data, names = likelihood.data_of(log, config), ("err_tran", "sigma_bearing", "outlier")
+    data, names = likelihood.data_from_log(log, config), ("err_tran", "sigma_bearing", "outlier")
     found = forward(numbers(params), data, KEY, config, names, "plain")
     choose = resampling.systematic  # has no derivative at all
     monkeypatch.setattr(
@@ -206,7 +206,7 @@ def test_plain_is_what_differentiation_of_the_value_gives(x64, scored, monkeypat
 
 def test_frames_of_nothing_at_the_end_change_nothing(x64, scored):
     log, params, config, names, bare = scored
-    data = likelihood.data_of(log, config, steps=len(log.frame_time) + 3)
+    data = likelihood.data_from_log(log, config, steps=len(log.frame_time) + 3)
     assert data.measurements.active.sum() == len(log.frame_time)
     padded = forward(numbers(params), data, KEY, config, names)
     np.testing.assert_allclose(padded.total, bare.total, rtol=1e-12)
@@ -216,7 +216,7 @@ def test_frames_of_nothing_at_the_end_change_nothing(x64, scored):
 
 def test_temporary_memory_does_not_grow_with_the_log():
     log, params, config = small()
-    data, used = likelihood.data_of(log, config), []
+    data, used = likelihood.data_from_log(log, config), []
 
     def repeated(steps):
         return jax.tree.map(
@@ -277,7 +277,7 @@ def test_what_is_refused():
     with pytest.raises(ValueError, match="estimator: 'score' is not one of fisher, pathwise, pla"):
         likelihood.log_likelihood(params, log, KEY, config, "score")
     with pytest.raises(ValueError, match="has 6 frames, more than the 5 asked for"):
-        likelihood.data_of(log, config, steps=5)
+        likelihood.data_from_log(log, config, steps=5)
 
 
 @pytest.mark.slow
@@ -292,7 +292,7 @@ def test_the_mean_score_is_that_of_particles_that_are_never_resampled(x64, senso
 
     def runs(config, estimator, count):
         def one(key):
-            found = likelihood.scored(params, data, key, config, names, estimator, 1.0)
+            found = likelihood.score_and_value(params, data, key, config, names, estimator, 1.0)
             return found.log_likelihood, found.total, found.min_ess
 
         keys = jax.random.split(jax.random.key(3), count)

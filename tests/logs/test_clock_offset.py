@@ -18,14 +18,14 @@ def room():
 
 @pytest.mark.parametrize("seconds", [-0.4, -0.1, 0.2])
 def test_the_offset_that_was_made_is_found(room, seconds):
-    as_it_is = clock_offset.offset(room)
+    as_it_is = clock_offset.estimate_clock_offset(room)
     assert abs(as_it_is.seconds) < clock_offset.FINE + 0.01 and as_it_is.least < 0 < as_it_is.most
-    found = clock_offset.offset(clock_offset.moved(room, seconds))
+    found = clock_offset.estimate_clock_offset(clock_offset.shift_frames(room, seconds))
     assert found.seconds == pytest.approx(as_it_is.seconds - seconds, abs=0.02)
     assert found.least <= found.seconds <= found.most
     # Identities and ranges play no part.
     hidden = dataclasses.replace(room, identity=None, range=None, truth=None)
-    assert clock_offset.offset(hidden) == as_it_is
+    assert clock_offset.estimate_clock_offset(hidden) == as_it_is
 
 
 def test_of_very_many_bearings_some_are_enough(room):
@@ -39,7 +39,7 @@ def test_of_very_many_bearings_some_are_enough(room):
     )
     pairs = clock_offset._pairs(crowd)
     assert max(len(part.apart) for part in pairs) <= clock_offset.ENOUGH + 300**2
-    assert clock_offset.offset(crowd) is None  # among so many something always fits
+    assert clock_offset.estimate_clock_offset(crowd) is None  # among so many something always fits
 
 
 def test_nothing_is_said_where_nothing_can_be_told(room):
@@ -47,17 +47,17 @@ def test_nothing_is_said_where_nothing_can_be_told(room):
     noise = dataclasses.replace(room, bearing=rng.uniform(-3, 3, len(room.bearing)))
     straight = dataclasses.replace(room, odometry=room.odometry * [1, 0])
     for log in (noise, straight, planar("room", 1, length_m=3.0), planar("room", 1, commands=True)):
-        assert clock_offset.offset(log) is None
+        assert clock_offset.estimate_clock_offset(log) is None
         assert not any("turning" in finding.text for finding in check(log))
-    far = clock_offset.moved(room, 2.0)
-    assert clock_offset.offset(far) is None
+    far = clock_offset.shift_frames(room, 2.0)
+    assert clock_offset.estimate_clock_offset(far) is None
 
 
 def test_check_says_it_and_convert_mends_it(room, call, at):
     log = load_log("lost-in-the-woods")
     (finding,) = [finding for finding in check(log) if "turning" in finding.text]
     assert finding.severity == "ok" and "best when moved by -0.1" in finding.text
-    save_log("late.npz", clock_offset.moved(room, 0.4))
+    save_log("late.npz", clock_offset.shift_frames(room, 0.4))
     code, out, _ = call("check", "late.npz")
     assert code == 1 and "best when moved by -0." in out and "--time-offset" in out
     assert call("convert", "late.npz", "mended.npz", "--time-offset", "-0.4")[0] == 0

@@ -17,7 +17,7 @@ def scene(sensor, seed):
     """A robot, the sensor on it, and a landmark in the sensor's own parameters."""
     rng = np.random.default_rng(seed)
     pose = tuple(rng.uniform(-3, 3, 3))
-    sensor_pose = sensors.pose_of(pose, PARAMS)
+    sensor_pose = sensors.sensor_pose_of(pose, PARAMS)
     anchor = tuple(rng.uniform(-1, 1, 2))
     mean = (
         tuple(rng.uniform([-3, 0.1], [3, 2]))
@@ -28,7 +28,7 @@ def scene(sensor, seed):
 
 
 def test_the_mounting_puts_the_sensor_on_the_robot():
-    got = sensors.pose_of((1.0, 2.0, np.pi / 2), PARAMS)
+    got = sensors.sensor_pose_of((1.0, 2.0, np.pi / 2), PARAMS)
     np.testing.assert_allclose(got, [1.1, 2.2, np.pi / 2 + 0.3], atol=1e-6)
 
 
@@ -38,12 +38,12 @@ def test_a_translation_gain_rescales_positions_that_rest_on_odometry():
     frame = sensors.Measurements(value, jnp.ones((2, 3)), None, None, None, scale)
 
     def total(gain):
-        return sensors.rescaled(frame, PARAMS._replace(gain_tran=gain)).value
+        return sensors.apply_position_scale(frame, PARAMS._replace(gain_tran=gain)).value
 
     np.testing.assert_allclose(total(1.1), [[2.2, 1.1], [3.0, -1.0]], rtol=1e-6)
     np.testing.assert_allclose(jax.jacobian(total)(1.1), [[2.0, 1.0], [0.0, 0.0]])
     unscaled = frame._replace(scale=None)
-    assert sensors.rescaled(unscaled, PARAMS._replace(gain_tran=2.0)) is unscaled
+    assert sensors.apply_position_scale(unscaled, PARAMS._replace(gain_tran=2.0)) is unscaled
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
@@ -138,7 +138,7 @@ def test_gradients_by_parameters_are_finite_at_the_landmark(sensor):
         mean = (0.0, 0.5) if sensor == "bearing" else (0.0, 0.0)
         anchor = (-2.0, 0.0)
         seen = sensors.observe(
-            sensor, sensors.pose_of((0.0, 0.0, 0.0), params), mean, anchor, params
+            sensor, sensors.sensor_pose_of((0.0, 0.0, 0.0), params), mean, anchor, params
         )
         return sum(jnp.sum(part) for part in jax.tree.leaves(seen.value))
 
@@ -149,7 +149,7 @@ def test_gradients_by_parameters_are_finite_at_the_landmark(sensor):
 def test_correlated_noise_is_that_of_an_autoregression_averaged(x64):
     """The mean of many AR(1) errors is as certain as that of independent ones so inflated."""
     params = PARAMS._replace(correlation=0.4, sigma_bearing=0.03)
-    noisy = sensors.correlated(
+    noisy = sensors.correlated_noise(
         params, SimpleNamespace(distance=jnp.asarray(0.07), turn=jnp.asarray(0.3))
     )
     apart = 0.1 * np.abs(np.subtract.outer(np.arange(1500), np.arange(1500)))
@@ -165,14 +165,16 @@ def test_a_robot_that_stands_learns_next_to_nothing_and_white_errors_stay(x64):
         PARAMS._replace(correlation=0.4),
         SimpleNamespace(distance=jnp.asarray(0.0), turn=jnp.asarray(0.0)),
     )
-    ratio = float(sensors.correlated(params, still).sigma_range) / params.sigma_range
+    ratio = float(sensors.correlated_noise(params, still).sigma_range) / params.sigma_range
     assert ratio**2 == pytest.approx(sensors.MOST_INFLATION, rel=1e-3)
-    white = sensors.correlated(PARAMS._replace(correlation=0.0), still)
+    white = sensors.correlated_noise(PARAMS._replace(correlation=0.0), still)
     assert float(white.sigma_range) == PARAMS.sigma_range
 
     def noise(correlation, distance):
         moved = SimpleNamespace(distance=distance, turn=0.0)
-        return sensors.correlated(PARAMS._replace(correlation=correlation), moved).sigma_bearing
+        return sensors.correlated_noise(
+            PARAMS._replace(correlation=correlation), moved
+        ).sigma_bearing
 
     for correlation, distance in ((0.0, 0.0), (0.4, 0.0), (0.4, 0.1), (1e-3, 5.0)):
         assert np.isfinite(jax.grad(noise, (0, 1))(correlation, distance)).all()
@@ -182,7 +184,7 @@ def test_a_robot_that_stands_learns_next_to_nothing_and_white_errors_stay(x64):
 def test_correlated_noise_is_the_baselines(x64, distance):
     params = PARAMS._replace(correlation=0.4)
     moved = SimpleNamespace(distance=distance, turn=distance / 2)
-    noisy = sensors.correlated(params, moved)
-    model = fastslam.dulled(fastslam.make_model(params, Config()), moved)
+    noisy = sensors.correlated_noise(params, moved)
+    model = fastslam.with_extra_noise(fastslam.make_model(params, Config()), moved)
     for name in ("sigma_range", "sigma_bearing", "growth", "position_scale"):
         assert getattr(model, name) == pytest.approx(float(getattr(noisy, name)), rel=1e-9)

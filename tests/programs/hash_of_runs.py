@@ -21,8 +21,8 @@ for change in json.loads(sys.argv[3]):
     runs, folder = change.pop("runs", 0), change.pop("save", None)
     config = config_for(log, **settings | change)
     if runs:  # three of them, shared by so many devices; the first is looked at
-        todo = batch.tasks("3,5,6", default_params(config.sensor, log))
-        found = batch.run(log, config, todo, refine=False, devices=runs)[0]
+        todo = batch.plan_tasks("3,5,6", default_params(config.sensor, log))
+        found = batch.run_tasks(log, config, todo, refine=False, devices=runs)[0]
     else:
         found = run.run(log, config, seed=3, refine=False)
     if folder:

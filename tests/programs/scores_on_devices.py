@@ -17,9 +17,9 @@ from jaxslam.learning import fit, transforms
 
 logs = [drive(1), drive(2), drive(3)]
 params = default_params("range_bearing", logs[0])
-data = fit.stacked(logs, CONFIG, params)
+data = fit.stack_logs(logs, CONFIG, params)
 numbers = Params(*(jnp.float32(v) for v in params))
-free = jnp.asarray(transforms.taken(params, NAMES), jnp.float32)
+free = jnp.asarray(transforms.free_vector(params, NAMES), jnp.float32)
 keys = jax.random.split(jax.random.key(0), 3)
 found = fit.scores(free, numbers, data, np.arange(3), keys, CONFIG, NAMES, 0.97)
 assert len(jax.devices()) == int(sys.argv[1])

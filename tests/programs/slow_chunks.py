@@ -10,7 +10,7 @@ import time
 from jaxslam.cli import main as cli
 from jaxslam.runs import compiled, run
 
-chunk, compiled.CHUNK = run._chunk, 7
+chunk, compiled.CHUNK = run._run_chunk, 7
 
 
 def slow(*given):
@@ -22,5 +22,5 @@ def slow(*given):
     return chunk(*given)
 
 
-run._chunk = slow
+run._run_chunk = slow
 sys.exit(cli.main())

@@ -21,20 +21,20 @@ world = Landmarks(
     anchor=None,
     log_odds=None,
     count=rng.integers(0, 9, (24, 160)).astype("i"),
-    birth=rng.integers(0, 9, (24, 160)).astype("i"),
+    landmark_id=rng.integers(0, 9, (24, 160)).astype("i"),
 )
 behind = rng.integers(-1, 2, 24).astype("i")
 for amount in map(int, sys.argv[1:]):
     chains = np.arange(160) + amount + rng.integers(-2, 3, (2, 160))
     chains = np.sort(np.clip(chains, 0, 159), -1).astype("i")
-    past = lazy_resampling.new(config)._replace(
+    past = lazy_resampling.empty_ancestry(config)._replace(
         chains=jnp.asarray(chains), chain=jnp.asarray(behind)
     )
     wanted = rng.uniform(size=24) < 0.8
-    found, after = sharding.divided(
-        partial(lazy_resampling.update, config=config),
-        (sharding.lanes(world), sharding.same(past), sharding.ALL),
-        (sharding.lanes(world), sharding.same(past)),
+    found, after = sharding.shard_map(
+        partial(lazy_resampling.apply_ancestry, config=config),
+        (sharding.particle_sharded(world), sharding.replicated(past), sharding.ALL),
+        (sharding.particle_sharded(world), sharding.replicated(past)),
         config,
     )(jax.tree.map(jnp.asarray, world), past, jnp.asarray(wanted))
     due = wanted & (behind >= 0)
@@ -44,4 +44,4 @@ for amount in map(int, sys.argv[1:]):
             expected[..., slot, :] = one[..., slot, chains[behind[slot]]]
         np.testing.assert_array_equal(leaf, expected)
     assert (np.asarray(after.chain) == np.where(due, -1, behind)).all()
-    print(bool(halo_exchange.enough(past.chains, config).all()), int(due.sum()))
+    print(bool(halo_exchange.suffices(past.chains, config).all()), int(due.sum()))

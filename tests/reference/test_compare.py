@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxslam.config import SENSORS, Config, default_params
-from jaxslam.filter.frames import frames
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.log_file import load_log
 from jaxslam.reference import compare, fastslam, variants
 from jaxslam.simulation import planar
@@ -25,7 +25,7 @@ DENSITY_NEW = {"position": 0.5, "range_bearing": 1e-3, "bearing": 0.05}
 def woods():
     """Two minutes of the bundled log: the robot starts, drives and turns."""
     log = load_log("lost-in-the-woods")
-    return compare.select(log, np.arange(0, 6 * STEPS, 6))
+    return compare.select_frames(log, np.arange(0, 6 * STEPS, 6))
 
 
 def assert_agree(log, config):
@@ -52,7 +52,7 @@ def test_baseline_and_filter_agree(woods, sensor, association):
 
 
 def test_baseline_and_filter_agree_on_points_that_rest_on_odometry(woods):
-    f = frames(woods, "position", params=default_params("position", woods))
+    f = frames_from_log(woods, "position", params=default_params("position", woods))
     cov = np.full((len(woods.frame), 3), np.nan)
     point, base = cov[:, :2].copy(), cov[:, 0].copy()
     rows = f.row[f.row >= 0]
@@ -168,16 +168,16 @@ def traces(steps=3, particles=2):
     weight = np.full((steps, particles), -np.log(2.0))
     weight[1, 1] = -np.inf
     ancestors = np.tile(np.arange(particles), (steps, 1))
-    birth = np.zeros((steps, 1, particles), int)
-    trace = compare._Trace(pose, weight, ancestors, birth, pose[:, :, 0])
+    landmark_id = np.zeros((steps, 1, particles), int)
+    trace = compare._Trace(pose, weight, ancestors, landmark_id, pose[:, :, 0])
     mark = SimpleNamespace(
-        mean=[1.0, 2.0], cov=[[4.0, 2.0], [2.0, 10.0]], count=3, birth=0, log_odds=1.0
+        mean=[1.0, 2.0], cov=[[4.0, 2.0], [2.0, 10.0]], count=3, landmark_id=0, log_odds=1.0
     )
     reference = SimpleNamespace(
         poses=pose.copy(),
         log_weight=weight.copy(),
         ancestors=ancestors.copy(),
-        birth=np.swapaxes(birth, 1, 2).copy(),
+        landmark_id=np.swapaxes(landmark_id, 1, 2).copy(),
         particles=[SimpleNamespace(landmarks=[mark, None])] * particles,
     )
     world = SimpleNamespace(
@@ -186,7 +186,7 @@ def traces(steps=3, particles=2):
         anchor=None,
         log_odds=np.tile([[1.0], [0.0]], particles),
         count=np.tile([[3], [0]], particles),
-        birth=np.zeros((2, particles), int),
+        landmark_id=np.zeros((2, particles), int),
     )
     return SimpleNamespace(landmarks=world), trace, reference
 
@@ -197,7 +197,7 @@ def test_differences_of_equal_runs_are_zero():
 
 def test_differences_stop_where_the_decisions_part():
     state, trace, reference = traces()
-    reference.birth[2, 1, 0] = fastslam.NEW
+    reference.landmark_id[2, 1, 0] = fastslam.NEW
     reference.poses[1, 2, 0] += 2 * np.pi + 0.25  # a full turn is no difference
     reference.poses[2] += 5
     same, pose, _, landmarks = compare._differences(state, trace, reference)
@@ -219,14 +219,14 @@ def test_different_sets_of_landmarks_are_infinitely_apart():
     state.landmarks.count[1, 1] = 1
     assert compare._differences(state, trace, reference)[3] == np.inf
     state, trace, reference = traces()
-    state.landmarks.birth[0, 1] = 1
+    state.landmarks.landmark_id[0, 1] = 1
     assert compare._differences(state, trace, reference)[3] == np.inf
 
 
 def test_selected_frames_keep_their_measurements():
     log = planar.planar(length_m=3.0, seed=2)
     kept = np.arange(1, len(log.frame_time), 3)
-    part = compare.select(log, kept)
+    part = compare.select_frames(log, kept)
     assert np.array_equal(part.frame_time, log.frame_time[kept])
     assert part.start == log.start  # the odometry is all there
     for new, old in enumerate(kept):

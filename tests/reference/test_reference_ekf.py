@@ -55,7 +55,7 @@ def test_created_landmark_predicts_its_own_measurement(sensor):
     np.testing.assert_allclose(view.value, reading.value, atol=1e-12)
     cov = view.jacobian @ landmark.cov @ view.jacobian.T
     np.testing.assert_allclose(cov, ekf.noise(view.range, reading, model), atol=1e-12)
-    assert (landmark.count, landmark.birth, landmark.log_odds) == (1, 7, 1.0)
+    assert (landmark.count, landmark.landmark_id, landmark.log_odds) == (1, 7, 1.0)
     assert view.range == pytest.approx(1 / 0.3 if sensor == "bearing" else np.hypot(*[2, 1]), 0.02)
 
 

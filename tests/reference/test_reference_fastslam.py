@@ -137,7 +137,7 @@ def test_known_identities_match_create_call_clutter_and_overflow():
     assert (result.births[:, 0].tolist(), result.overflow[:, 0].tolist()) == ([2, 0], [0, 1])
     marks = result.particles[0].landmarks
     assert marks[1] is None
-    assert (marks[0].birth, marks[2].birth) == (1, 0)
+    assert (marks[0].landmark_id, marks[2].landmark_id) == (1, 0)
     model = make_model()
     expected = math.log(0.02 / 40) + math.log(0.98 * 0.1 * 4)  # clutter, and new without a slot
     view = ekf.predict(marks[2], ekf.sensor_pose(np.array([1, 2, 0.5]), model), model)
@@ -161,7 +161,7 @@ def test_births_take_the_lowest_slot_and_a_full_map_overflows():
     assert result.match[:, 0].tolist() == [[-1, -3, -3], [-1, -1, -1]]
     assert result.slot[:, 0].tolist() == [[0, -1, -1], [1, -1, -1]]
     assert (result.births[:, 0].tolist(), result.overflow[:, 0].tolist()) == ([1, 1], [0, 2])
-    assert [mark.birth for mark in result.particles[0].landmarks] == [0, 3]
+    assert [mark.landmark_id for mark in result.particles[0].landmarks] == [0, 3]
     expected = 3 * math.log(0.98 * 0.1) + math.log(2 * 2 * 4)
     assert result.log_evidence[1] == pytest.approx(expected)
 
@@ -180,7 +180,7 @@ def test_frame_number_counts_from_first_step():
         5,
         lambda *x: seen.append(x),
     )
-    assert [mark.birth for mark in result.particles[0].landmarks[:2]] == [15, 16]
+    assert [mark.landmark_id for mark in result.particles[0].landmarks[:2]] == [15, 16]
     assert seen == [(1, 1)]
 
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from jaxslam.results.events import entropy
+from jaxslam.results.events import association_entropy
 
 
 def test_entropy_counts_particles_as_often_as_they_go_on():
-    birth = np.array([[[7, 7, 7, 7], [3, 3, -2, 5]], [[1, 1, 2, 2], [-3, -3, -3, -3]]])
+    landmark_id = np.array([[[7, 7, 7, 7], [3, 3, -2, 5]], [[1, 1, 2, 2], [-3, -3, -3, -3]]])
     ancestors = np.array([[0, 0, 2, 3], [0, 1, 2, 3]])
-    found = entropy(birth, ancestors)
+    found = association_entropy(landmark_id, ancestors)
     assert found[0, 0] == found[1, 1] == 0
     half, quarter = 0.5 * np.log(2), 0.25 * np.log(4)
     assert found[0, 1] == pytest.approx(half + 2 * quarter)
@@ -17,4 +17,4 @@ def test_entropy_counts_particles_as_often_as_they_go_on():
 
 
 def test_what_dies_out_does_not_count():
-    assert entropy(np.array([[[1, 1, 9]]]), np.array([[0, 1, 1]])).tolist() == [[0.0]]
+    assert association_entropy(np.array([[[1, 1, 9]]]), np.array([[0, 1, 1]])).tolist() == [[0.0]]

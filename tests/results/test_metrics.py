@@ -181,7 +181,7 @@ def test_an_empty_map_misses_everything():
 
 
 def test_errors_of_a_shifted_run_are_the_shift_and_nothing_after_alignment():
-    found = metrics.errors(make_result(shift=0.1))
+    found = metrics.compute_errors(make_result(shift=0.1))
     assert found["ate_filtered_rmse_m"] == pytest.approx(0, abs=1e-9)
     assert found["ate_filtered_unaligned_rmse_m"] == pytest.approx(0.1)
     assert found["ate_filtered_unaligned_max_m"] == pytest.approx(0.1)
@@ -199,7 +199,7 @@ def test_errors_of_a_shifted_run_are_the_shift_and_nothing_after_alignment():
 
 
 def test_what_looks_back_is_measured_as_the_filter_is():
-    plain, found = metrics.errors(make_result()), metrics.errors(make_refined())
+    plain, found = metrics.compute_errors(make_result()), metrics.compute_errors(make_refined())
     assert plain.items() <= found.items()
     assert not [key for key in plain if "refined" in key or "ancestral" in key]
     for name, off in (("filtered", 0.1), ("ancestral", 0.08), ("refined", 0.05)):
@@ -222,23 +222,23 @@ def test_what_looks_back_is_measured_as_the_filter_is():
 
 def test_errors_leave_out_what_cannot_be_computed():
     result = make_result()
-    assert metrics.errors(make_result(truth=False)) == {}
+    assert metrics.compute_errors(make_result(truth=False)) == {}
     only_map = dataclasses.replace(result.log, truth=Truth(landmarks=LANDMARKS))
-    assert set(metrics.errors(result, only_map)) == {
+    assert set(metrics.compute_errors(result, only_map)) == {
         "landmark_filtered_unaligned_rmse_m",
         "landmark_gate_m",
         *(f"landmarks_unaligned_{kind}" for kind in ("matched", "missed", "spurious")),
     }
     coarse = dataclasses.replace(result.log.truth, resolution=0.3, landmarks=None, landmark_id=None)
-    found = metrics.errors(result, dataclasses.replace(result.log, truth=coarse))
+    found = metrics.compute_errors(result, dataclasses.replace(result.log, truth=coarse))
     assert found["truth_resolution_m"] == 0.3
     assert not [key for key in found if key.startswith(("rpe", "landmark"))]
 
 
 def with_match(result, frame, slot, value):
-    match = np.array(result.match)
+    match = np.array(result.landmark_id)
     match[frame, slot] = value
-    return dataclasses.replace(result, match=match)
+    return dataclasses.replace(result, landmark_id=match)
 
 
 @pytest.mark.parametrize(

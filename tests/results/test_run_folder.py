@@ -13,7 +13,7 @@ from jaxslam.config import Config, Params
 from jaxslam.logs.log import Truth
 from jaxslam.logs.log_file import save_log
 from jaxslam.results import load, metrics, run_folder
-from jaxslam.results.events import events as events_of
+from jaxslam.results.events import list_events as events_of
 from jaxslam.results.tables import error_table
 
 NAME = "lost-in-the-woods"
@@ -40,7 +40,7 @@ def test_what_is_saved_is_loaded_again(tmp_path, make):
         if item.name not in ("log", "params"):
             assert same(getattr(loaded, item.name), getattr(result, item.name)), item.name
     assert loaded.params == tuple(map(float, result.params))
-    assert load.evaluate_folder(tmp_path / "run") == metrics.errors(result)
+    assert load.evaluate_folder(tmp_path / "run") == metrics.compute_errors(result)
 
 
 def test_what_was_refined_has_files_of_its_own(tmp_path):
@@ -142,7 +142,7 @@ def test_summary_has_the_stable_keys_and_the_errors(tmp_path):
     told |= dict(proposal="prior", seed=7)
     assert summary | told == summary
     assert set(summary["versions"]) == {"jaxslam", "jax", "numpy", "python"}
-    assert summary | metrics.errors(result) == summary
+    assert summary | metrics.compute_errors(result) == summary
     assert any("measurement slot" in line for line in summary["warnings"])
 
 
@@ -278,7 +278,7 @@ def test_broken_folders_are_named(tmp_path):
 
 
 def test_error_table_puts_dead_reckoning_beside_the_filter():
-    found = metrics.errors(make_result())
+    found = metrics.compute_errors(make_result())
     lines = error_table(found).splitlines()
     assert lines[0].split() == HEAD
     assert lines[1].split() == ["path,", "filter", "0.000", "m", *["0.100", "m"] * 3]
@@ -287,14 +287,14 @@ def test_error_table_puts_dead_reckoning_beside_the_filter():
     assert "4 matched, 0 missed, 1 spurious (gate 0.50 m)" in error_table(found)
     assert "refined" not in error_table(found) and "ancestral" not in error_table(found)
     only_map = dataclasses.replace(make_log(), truth=Truth(landmarks=LANDMARKS))
-    table = error_table(metrics.errors(make_result(), only_map))
+    table = error_table(metrics.compute_errors(make_result(), only_map))
     assert "path" not in table
     assert "0.100 m" in table
     assert "no truth" in error_table({})
 
 
 def test_error_table_shows_every_path_and_both_maps():
-    lines = error_table(metrics.errors(make_refined())).splitlines()
+    lines = error_table(metrics.compute_errors(make_refined())).splitlines()
     labels = [line[:24].strip() for line in lines[1:5]]
     assert labels == [f"path, {n}" for n in ("filter", "ancestral", "refined", "dead reckoning")]
     assert [line.split()[-2] for line in lines[1:4]] == ["0.100", "0.080", "0.050"]

@@ -23,16 +23,16 @@ def woods():
 def three(woods):
     """Three tasks, worked off in programs of two, and their results."""
     config = run.config_for(woods, "range_bearing", **CONFIG)
-    todo = batch.tasks("1,4", default_params("range_bearing", woods), ["err_rot=0.05,0.2"])[:3]
+    todo = batch.plan_tasks("1,4", default_params("range_bearing", woods), ["err_rot=0.05,0.2"])[:3]
     before, batch.BYTES = batch.BYTES, 2 * state_bytes(config)
     try:
-        return config, todo, batch.run(woods, config, todo, refine=False)
+        return config, todo, batch.run_tasks(woods, config, todo, refine=False)
     finally:
         batch.BYTES = before
 
 
 def state_bytes(config):
-    return batch.capacity.of_arrays(compiled.shapes(config))
+    return batch.capacity.of_arrays(compiled.state_shapes(config))
 
 
 def test_each_run_is_bit_for_bit_what_it_is_alone(woods, three):
@@ -53,7 +53,7 @@ def test_each_run_is_bit_for_bit_what_it_is_alone(woods, three):
 
 def test_the_table_has_a_line_for_each_run_and_its_mean_and_spread(three):
     _, todo, results = three
-    found = batch.rows(todo, results)
+    found = batch.summary_rows(todo, results)
     lines = batch.table(found).splitlines()
     assert [line.split()[0] for line in lines] == ["seed", "1", "4", "mean", "sd", "1"]
     evidence = [row["log_likelihood"] for row in found[:2]]
@@ -84,13 +84,13 @@ def test_saved_are_the_table_and_each_runs_folder(three, woods, tmp_path):
     ("text", "found"), [("3", [3]), ("0-3", [0, 1, 2, 3]), ("7, 1-2,1", [7, 1, 2])]
 )
 def test_seeds(text, found):
-    assert batch.numbers(text) == found
+    assert batch.parse_seeds(text) == found
 
 
 @pytest.mark.parametrize("text", ["", "3-1", "a", "1,", "-1", "0-4294967296"])
 def test_what_are_no_seeds(text):
     with pytest.raises(ValueError, match=r"--seeds is .*must be whole numbers"):
-        batch.numbers(text)
+        batch.parse_seeds(text)
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_what_are_no_seeds(text):
 )
 def test_what_is_no_sweep(sweeps, problem):
     with pytest.raises(ValueError, match=problem):
-        batch.tasks("0", default_params(), sweeps)
+        batch.plan_tasks("0", default_params(), sweeps)
 
 
 def test_seeds_are_for_runs_without_checkpoints(capsys):

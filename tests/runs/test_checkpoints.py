@@ -96,7 +96,7 @@ def test_a_resumed_run_is_bit_for_bit_the_undisturbed_one(log, tmp_path, monkeyp
     same(columns(gone_on(log, config, folder, said)), whole)
     assert "note: goes on after step 18, from step-00000018.npz" in said
     # The end was put aside as well: nothing is filtered or compiled again.
-    monkeypatch.setattr(compiled, "compiled", None)
+    monkeypatch.setattr(compiled, "compile_loop", None)
     same(columns(gone_on(log, config, folder)), whole)
 
 
@@ -134,7 +134,7 @@ def test_a_broken_checkpoint_is_said_and_the_one_before_it_taken(log, tmp_path, 
         said = []
         with pytest.raises(Stop), offline.Checkpoints(folder, 0, True, say=said.append) as places:
             places.begin(log, config, default_params(config.sensor, log), 3)
-            assert places.restore(compiled.shapes(config)).done == 7
+            assert places.restore(compiled.state_shapes(config)).done == 7
             raise Stop
         assert sum(line.startswith("warning: a broken checkpoint is left aside: ") for line in said)
         assert newest.name in said[0]
@@ -178,7 +178,7 @@ def test_another_run_is_not_gone_on_with(there, log, call, refuse, monkeypatch):
 
 def died(call, monkeypatch, chunks=2):
     """A run in `out` that has died, by a full disk, when it was to write its next checkpoint."""
-    write, left = checkpoint_file.write, [chunks]
+    write, left = checkpoint_file.write_checkpoint, [chunks]
 
     def failing(path, about, columns):
         left[0] -= 1
@@ -190,9 +190,9 @@ def died(call, monkeypatch, chunks=2):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     fsync = os.fsync
-    monkeypatch.setattr(checkpoint_file, "write", failing)
+    monkeypatch.setattr(checkpoint_file, "write_checkpoint", failing)
     found = call(*LONG)
-    monkeypatch.setattr(checkpoint_file, "write", write)
+    monkeypatch.setattr(checkpoint_file, "write_checkpoint", write)
     monkeypatch.setattr(os, "fsync", fsync)
     return found
 
@@ -283,13 +283,13 @@ def test_what_the_dead_left_is_cleared_away(there, call, monkeypatch):
     ("text", "value"), [("60s", 60), ("5m", 300), ("1h", 3600), ("90", 90), ("0.5s", 0.5)]
 )
 def test_times(text, value):
-    assert offline.seconds(text) == value
+    assert offline.parse_interval(text) == value
 
 
 @pytest.mark.parametrize("text", ["", "0s", "s", "5 days", "-3", "1e3", "nan"])
 def test_no_times(text):
     with pytest.raises(ValueError, match="must be a time above 0"):
-        offline.seconds(text)
+        offline.parse_interval(text)
 
 
 SLOW = Path(__file__).parents[1] / "programs" / "slow_chunks.py"
@@ -341,7 +341,7 @@ def test_ctrl_c_while_refining_says_how_to_go_on(there, call, monkeypatch):
 
     refining = [word for word in LONG if word != "--no-refine"]
     with monkeypatch.context() as patch:
-        patch.setattr(run, "refined", interrupted)
+        patch.setattr(run, "refine_result", interrupted)
         code, _, err = call(*refining)
     assert code == 130
     assert err.splitlines()[-1] == (
@@ -352,13 +352,13 @@ def test_ctrl_c_while_refining_says_how_to_go_on(there, call, monkeypatch):
 
 
 def test_a_lock_dies_with_its_process_and_its_file_may_be_removed(tmp_path):
-    handle = run_lock.take(tmp_path)
+    handle = run_lock.acquire(tmp_path)
     with pytest.raises(BlockingIOError, match=f"process {os.getpid()} on "):
-        run_lock.check(tmp_path)
+        run_lock.check_unlocked(tmp_path)
     os.close(handle)
-    run_lock.check(tmp_path)
+    run_lock.check_unlocked(tmp_path)
     assert (tmp_path / "lock").exists()
-    os.close(run_lock.take(tmp_path))
+    os.close(run_lock.acquire(tmp_path))
 
 
 @pytest.mark.slow

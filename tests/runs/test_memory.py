@@ -18,8 +18,8 @@ def there(at):
 
 
 def test_too_large_is_refused_before_anything_is_computed(there, refuse, monkeypatch):
-    monkeypatch.setattr(memory, "available", lambda: 30_000_000_000)
-    monkeypatch.setattr(compiled, "compiled", None)
+    monkeypatch.setattr(memory, "available_bytes", lambda: 30_000_000_000)
+    monkeypatch.setattr(compiled, "compile_loop", None)
     for more in ((), ("--checkpoint-every", "5m")):
         line = refuse(
             "run", "log.npz", "--particles", 10**7, "--landmarks", 300, "--out", "x", *more
@@ -29,15 +29,15 @@ def test_too_large_is_refused_before_anything_is_computed(there, refuse, monkeyp
     assert os.listdir() == ["log.npz"]
     most = int(line.split("--particles ")[1].split()[0])
     config = config_for(load_log("log.npz"), particles=most, landmarks=300)
-    assert 25e9 < compiled.needed(config, 24).total < 30e9
+    assert 25e9 < compiled.estimate_memory(config, 24).total < 30e9
 
 
 def test_the_compilers_own_temporaries_count(there, call, monkeypatch):
     config = config_for(load_log("log.npz"), particles=30, landmarks=30)
-    quick, whole = compiled.needed(config, 24), checkpoints.memory(config, 24)
-    assert whole.state == quick.state == memory.of_arrays(compiled.shapes(config))
+    quick, whole = compiled.estimate_memory(config, 24), checkpoints.memory_of_run(config, 24)
+    assert whole.state == quick.state == memory.bytes_of(compiled.state_shapes(config))
     assert whole.temporaries > 0 and whole.total > quick.total
-    monkeypatch.setattr(memory, "available", lambda: quick.total + 1)
+    monkeypatch.setattr(memory, "available_bytes", lambda: quick.total + 1)
     code, _, err = call(
         "run", "log.npz", "--particles", 30, "--landmarks", 30, "--out", "new/out",
         "--checkpoint-every", "5m",
@@ -61,6 +61,6 @@ def test_limits_of_control_groups(tmp_path):
         for name, value in zip(names, ("max" if folder == second else "1000", "300"), strict=True):
             (folder / name).write_text(value + "\n")
         (folder / "memory.stat").write_text(stat)
-    found = [size for size in memory._of_groups(tmp_path, own) if size is not None]
+    found = [size for size in memory._cgroup_bytes(tmp_path, own) if size is not None]
     assert found == [705, 710]
-    assert memory.available() is None or memory.available() > 0
+    assert memory.available_bytes() is None or memory.available_bytes() > 0

@@ -43,7 +43,7 @@ def test_where_they_are_too_many_landmarks_seen_once_are_left_out(log, monkeypat
     config = run.config_for(log, "range_bearing", particles=30, landmarks=30)
     whole = run.run(log, config)
     of, label = np.array([0, 2, -1, 2, 1, 0]), np.array([7, 8, 9])
-    fewer = refine._seen_again(reassociation.Groups(of, label, np.arange(6.0).reshape(3, 2)))
+    fewer = refine._reobserve(reassociation.Groups(of, label, np.arange(6.0).reshape(3, 2)))
     np.testing.assert_array_equal(fewer.of, [0, 1, -1, 1, -1, 0])
     np.testing.assert_array_equal(fewer.label, [7, 9])
     np.testing.assert_array_equal(fewer.point, [[0, 1], [4, 5]])
@@ -62,7 +62,7 @@ def test_identities_without_a_slot_do_not_stop_rejuvenation(log):
 
 def test_values_of_a_sweep_have_folders_of_their_own(log):
     params = default_params("range_bearing", log)
-    todo = batch.tasks("3", params, ["gain_rot=1.0000001,1.0000002,1.0000001"])
+    todo = batch.plan_tasks("3", params, ["gain_rot=1.0000001,1.0000002,1.0000001"])
     assert len(todo) == 2
     names = [batch._short(task.told["gain_rot"]) for task in todo]
     assert names == ["1.0000001", "1.0000002"]

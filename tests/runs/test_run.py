@@ -14,7 +14,7 @@ from jaxslam.filter import step as fastslam
 from jaxslam.results.metrics import ate
 from jaxslam.runs import assemble, compiled
 from jaxslam.runs import run as runner
-from jaxslam.runs.run import config_for, refined
+from jaxslam.runs.run import config_for, refine_result
 from jaxslam.simulation.planar import planar
 
 SIZES = dict(particles=30, landmarks=30, measurements=10)  # test_offline's: compiled once
@@ -93,10 +93,10 @@ def test_landmarks_without_a_depth_stay_out_of_the_map():
     state = fastslam.init(config, jax.random.key(0))
     depth, sd = jnp.array([0.5, 0.5, 0.5]), jnp.array([0.01, 0.25, 0.01])
     given = jnp.stack([jnp.zeros(3), depth]), jnp.stack([jnp.full(3, 0.01), jnp.zeros(3), sd])
-    world = new_landmarks.given(state.landmarks, (*given, jnp.ones((2, 3))))
+    world = new_landmarks.place_given(state.landmarks, (*given, jnp.ones((2, 3))))
     # The third slot is empty.
     world = world._replace(
-        count=world.count.at[2].set(0), birth=jnp.array([[7, 7], [8, 8], [9, 9]], jnp.int32)
+        count=world.count.at[2].set(0), landmark_id=jnp.array([[7, 7], [8, 8], [9, 9]], jnp.int32)
     )
     params = default_params("bearing")
     found = assemble._map(
@@ -122,18 +122,18 @@ def test_result_means_something(log, config, result):
 
 def test_matches_tell_which_measurement_began_the_landmark(log, config, result):
     # Every measurement in its slot, padding elsewhere.
-    np.testing.assert_array_equal(result.match == -3, result.row == -1)
+    np.testing.assert_array_equal(result.landmark_id == -3, result.row == -1)
     np.testing.assert_array_equal(np.sort(result.row[result.row >= 0]), np.arange(len(log.frame)))
-    assert ((result.match >= -3) & (result.match < result.match.size)).all()
-    frame, _ = np.nonzero(result.match >= 0)
-    births = result.match[result.match >= 0]
+    assert ((result.landmark_id >= -3) & (result.landmark_id < result.landmark_id.size)).all()
+    frame, _ = np.nonzero(result.landmark_id >= 0)
+    births = result.landmark_id[result.landmark_id >= 0]
     assert (births < frame * config.measurements).all()  # from an earlier frame
     # What is matched was measured there: a landmark's measurements are of one true landmark.
     began = result.row[np.divmod(births, config.measurements)]
-    again = result.row[result.match >= 0]
+    again = result.row[result.landmark_id >= 0]
     identity = log.truth.identity
     assert np.mean(identity[began] == identity[again]) > 0.95
-    assert set(result.landmarks.id) <= set(births) | set(np.flatnonzero(result.match == -1))
+    assert set(result.landmarks.id) <= set(births) | set(np.flatnonzero(result.landmark_id == -1))
 
 
 def test_progress_is_told_from_the_start_to_the_end(log, result, calls):
@@ -155,15 +155,15 @@ def test_the_past_is_that_of_the_living(log, config, result):
     found, past = result.ancestral, result.lineage
     t, k = len(log.frame_time), config.measurements
     assert (found.pose.shape, found.cov.shape, found.distinct.shape) == ((t, 3), (t, 3, 3), (t,))
-    assert (past.pose.shape, past.birth.shape) == ((t, 3), (t, k))
+    assert (past.pose.shape, past.landmark_id.shape) == ((t, 3), (t, k))
     assert (np.diff(found.distinct) >= 0).all() and found.distinct[-1] <= config.particles
     assert found.distinct[0] == 1 < found.distinct[-1]
     true = log.truth.pose
     assert ate(found.pose, true, align=False)[0] < 1.1 * ate(result.pose, true, align=False)[0]
     np.testing.assert_allclose(found.pose[0], past.pose[0], atol=1e-6)
     # Most of what one particle took measurements for is what the best one did, frame by frame.
-    assert np.mean(past.birth == result.match) > 0.9
-    np.testing.assert_array_equal(past.birth == -3, result.row == -1)
+    assert np.mean(past.landmark_id == result.landmark_id) > 0.9
+    np.testing.assert_array_equal(past.landmark_id == -3, result.row == -1)
     (line,) = result.advice
     assert line.startswith("all particles share one past up to ")
     assert result.refined is result.landmarks_refined is None
@@ -190,7 +190,7 @@ def test_a_genealogy_that_takes_too_much_memory_is_given_up(log, config, monkeyp
 
 def test_refining_is_told_and_comes_near_the_truth(log, result):
     calls = []
-    found = refined(result, lambda *args: calls.append(args))
+    found = refine_result(result, lambda *args: calls.append(args))
     assert len(calls) > 1 and {total for _, total in calls} == {None}
     assert found.refine_seconds > 0
     true = log.truth.pose
@@ -219,7 +219,7 @@ def test_far_from_the_origin_is_the_same(log, config, result):
     np.testing.assert_allclose(far.pose - shift, result.pose, atol=1e-3)
     np.testing.assert_allclose(far.dead_reckoning - shift, result.dead_reckoning, atol=1e-3)
     np.testing.assert_allclose(far.landmarks.mean - shift[:2], result.landmarks.mean, atol=1e-3)
-    np.testing.assert_array_equal(far.match, result.match)
+    np.testing.assert_array_equal(far.landmark_id, result.landmark_id)
 
 
 def test_what_was_lost_is_flagged(config, result):

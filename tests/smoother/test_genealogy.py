@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxslam.smoother.genealogy import Tree, ancestral, lineage
+from jaxslam.smoother.genealogy import Tree, smooth_ancestral, trace_lineage
 
 N, K = 40, 3
 
@@ -12,12 +12,12 @@ def history(steps, resample_every, seed=0, n=N):
     """Poses [T, 3, n], births [T, K, n] and ancestors [T, n] of a made-up particle filter."""
     rng = np.random.default_rng(seed)
     pose = rng.normal(0, [[1.0], [2.0], [9.0]], (steps, 3, n)).astype(np.float32)
-    birth = rng.integers(-3, 99, (steps, K, n), np.int32)
+    landmark_id = rng.integers(-3, 99, (steps, K, n), np.int32)
     ancestors = np.tile(np.arange(n, dtype=np.int32), (steps, 1))
     if resample_every:
         chosen = ancestors[resample_every - 1 :: resample_every]
         chosen[:] = np.sort(rng.integers(0, n, chosen.shape), 1)
-    return pose, birth, ancestors
+    return pose, landmark_id, ancestors
 
 
 def grown(history, chunk):
@@ -27,14 +27,14 @@ def grown(history, chunk):
     return tree
 
 
-def all_pasts(pose, birth, ancestors):
+def all_pasts(pose, landmark_id, ancestors):
     """Every living particle's path [n, T, 3] and births [n, T, K], by following each one back."""
     place = np.arange(pose.shape[2])
     path, births = [], []
     for t in reversed(range(len(pose))):
         place = ancestors[t][place]
         path.append(pose[t][:, place].T)
-        births.append(birth[t][:, place].T)
+        births.append(landmark_id[t][:, place].T)
     return np.stack(path[::-1], 1).astype(float), np.stack(births[::-1], 1)
 
 
@@ -46,7 +46,7 @@ def test_the_tree_is_what_following_every_particle_back_gives(resample_every, ch
     path, births = all_pasts(*told)
     log_weight = np.random.default_rng(1).normal(0, 2, N) + 1000.0
     log_weight[::4] = -np.inf
-    found = ancestral(tree, log_weight)
+    found = smooth_ancestral(tree, log_weight)
     weight = np.exp(log_weight - 1000)
     weight /= weight.sum()
     turn = np.angle(np.einsum("n,nt->t", weight, np.exp(1j * path[..., 2])))
@@ -60,15 +60,15 @@ def test_the_tree_is_what_following_every_particle_back_gives(resample_every, ch
         assert found.distinct[t] == len(np.unique(path[heavy, t], axis=0))
         assert len(tree.pose[t]) == len(np.unique(path[:, t], axis=0))  # and nothing dead is kept
     for particle in (0, 7, N - 1):
-        one = lineage(tree, particle)
+        one = trace_lineage(tree, particle)
         np.testing.assert_array_equal(one.pose, path[particle])
-        np.testing.assert_array_equal(one.birth, births[particle])
+        np.testing.assert_array_equal(one.landmark_id, births[particle])
 
 
 def test_without_resampling_nothing_is_lost():
     tree = grown(history(30, 0), 7)
     assert tree.nodes == 30 * N
-    assert (ancestral(tree, np.zeros(N)).distinct == N).all()
+    assert (smooth_ancestral(tree, np.zeros(N)).distinct == N).all()
 
 
 def test_memory_does_not_grow_as_steps_times_particles():
@@ -81,10 +81,10 @@ def test_memory_does_not_grow_as_steps_times_particles():
 
 
 def test_a_pose_that_is_not_a_number_has_no_weight_and_does_no_harm():
-    pose, birth, ancestors = history(4, 0)
+    pose, landmark_id, ancestors = history(4, 0)
     pose[:, :, 3] = np.nan
     log_weight = np.zeros(N)
     log_weight[3] = -np.inf
-    found = ancestral(grown((pose, birth, ancestors), 2), log_weight)
+    found = smooth_ancestral(grown((pose, landmark_id, ancestors), 2), log_weight)
     assert np.isfinite(found.pose).all() and np.isfinite(found.cov).all()
     assert (found.distinct == N - 1).all()

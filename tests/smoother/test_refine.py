@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from jaxslam.config import default_params
-from jaxslam.filter.frames import Frames, frames
+from jaxslam.filter.frames import Frames, frames_from_log
 from jaxslam.logs.odometry import Odometry, dead_reckoning
 from jaxslam.logs.truth import wrap
 from jaxslam.models.sensors import Measurements
@@ -212,15 +212,15 @@ def test_the_world_may_be_turned():
     """Turning and shifting the world turns and shifts the answer, covariances too."""
     data, pose = problem_of_bearings(np.random.default_rng(5))
     params = params_of("bearing", sigma_bearing=0.03, growth=0.02, outlier=0.01)
-    birth, angle, shift = np.full((len(pose), 3), -1), 2.5, np.array([30.0, -7.0])
+    landmark_id, angle, shift = np.full((len(pose), 3), -1), 2.5, np.array([30.0, -7.0])
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     cov = np.diag([0.01, 0.02, 0.01])
     whole = np.eye(3)
     whole[:2, :2] = turn
-    one = refine(data, pose, birth, np.zeros(3), cov, params, "bearing", True)
+    one = refine(data, pose, landmark_id, np.zeros(3), cov, params, "bearing", True)
     moved = np.column_stack([pose[:, :2] @ turn.T + shift, wrap(pose[:, 2] + angle)])
     start = np.append(shift, angle)
-    two = refine(data, moved, birth, start, whole @ cov @ whole.T, params, "bearing", True)
+    two = refine(data, moved, landmark_id, start, whole @ cov @ whole.T, params, "bearing", True)
     np.testing.assert_allclose(two.pose[:, :2], one.pose[:, :2] @ turn.T + shift, atol=1e-5)
     np.testing.assert_allclose(wrap(two.pose[:, 2] - one.pose[:, 2] - angle), 0, atol=1e-5)
     np.testing.assert_allclose(two.mean, one.mean @ turn.T + shift, atol=1e-5)
@@ -233,7 +233,7 @@ def room(sensor, known, **changes):
         "room", 2, length_m=40.0, rate_hz=2.5, landmarks=14, max_per_frame=6, **changes
     )
     params = default_params(sensor, log)
-    data = frames(log, sensor, None, params, known)
+    data = frames_from_log(log, sensor, None, params, known)
     true = log.truth.pose
     along = np.linspace(0, 3, len(true))
     bent = true + np.stack([0.3 * np.sin(along), 0.3 * (np.cos(along) - 1), 0.1 * np.sin(along)], 1)
@@ -243,21 +243,21 @@ def room(sensor, known, **changes):
 def births(log, data):
     """True associations as a lineage's births."""
     who = np.where(data.row >= 0, log.truth.identity[data.row], -9)
-    birth = np.where(who == -9, -3, -2)
+    landmark_id = np.where(who == -9, -3, -2)
     for i in np.unique(who[who >= 0]):
         place = np.flatnonzero(who.ravel() == i)
-        birth.ravel()[place] = place[0]
-        birth.ravel()[place[0]] = -1
-    return birth, who
+        landmark_id.ravel()[place] = place[0]
+        landmark_id.ravel()[place[0]] = -1
+    return landmark_id, who
 
 
 @pytest.mark.parametrize("sensor", ["bearing", "range_bearing", "position"])
 def test_a_bent_path_is_straightened(sensor):
     """From 0.3 m off to where the true path leads, clutter found, and as sure as it is right."""
     log, data, params, true, bent = room(sensor, False)
-    birth, who = births(log, data)
-    got = refine(data, bent, birth, log.start_pose, log.start_cov, params, sensor)
-    best = refine(data, true, birth, log.start_pose, log.start_cov, params, sensor)
+    landmark_id, who = births(log, data)
+    got = refine(data, bent, landmark_id, log.start_pose, log.start_cov, params, sensor)
+    best = refine(data, true, landmark_id, log.start_pose, log.start_cov, params, sensor)
     assert got.converged
     assert np.abs(wrap(got.pose - best.pose)).max() < 1e-4
     assert ate(got.pose, true)[0] < 0.05
@@ -273,33 +273,33 @@ def test_a_bent_path_is_straightened(sensor):
     squared = np.einsum("ti,tij,tj->t", error, np.linalg.inv(got.cov), error)
     assert np.mean(squared < chi2.ppf(0.99, 3)) > 0.8
     assert 0.8 < got.residual < 1.1
-    right = (got.match == -2) == (who == -1)
+    right = (got.landmark_id == -2) == (who == -1)
     assert right[who > -9].mean() > 0.98
 
 
 def test_a_split_landmark_merges_and_one_of_clutter_leaves():
     log, data, params, _, bent = room("range_bearing", False)
-    birth, who = births(log, data)
+    landmark_id, who = births(log, data)
     half = np.arange(len(who)) > len(who) // 2
     split = [np.flatnonzero((who == i).ravel() & np.repeat(half, who.shape[1])) for i in (0, 1)]
     for place in split:
-        birth.ravel()[place] = place[0]
-        birth.ravel()[place[0]] = -1
+        landmark_id.ravel()[place] = place[0]
+        landmark_id.ravel()[place[0]] = -1
     noise = np.flatnonzero((who == -1).ravel())[:4]
-    birth.ravel()[noise[1:]] = noise[0]
-    birth.ravel()[noise[0]] = -1
+    landmark_id.ravel()[noise[1:]] = noise[0]
+    landmark_id.ravel()[noise[0]] = -1
     # and some clutter that the lineage called so, though it was none
     lost = np.flatnonzero((who == 3).ravel())[5:10]
-    birth.ravel()[lost] = -2
-    got = refine(data, bent, birth, log.start_pose, log.start_cov, params, "range_bearing")
+    landmark_id.ravel()[lost] = -2
+    got = refine(data, bent, landmark_id, log.start_pose, log.start_cov, params, "range_bearing")
     assert got.merged == 2
     assert got.dropped == 1
     assert len(got.mean) == len(np.unique(who[who >= 0]))
     assert noise[0] not in got.id
-    label = got.match.ravel()[lost]
+    label = got.landmark_id.ravel()[lost]
     assert len(np.unique(label)) == 1
     assert label[0] in got.id
-    assert got.n.sum() == np.sum(got.match >= -1)
+    assert got.n.sum() == np.sum(got.landmark_id >= -1)
 
 
 def test_wrong_identities_are_left_out():
@@ -314,8 +314,8 @@ def test_wrong_identities_are_left_out():
     none = np.full(wrong.shape, -1)
     got = refine(data, bent, none, log.start_pose, log.start_cov, params, "bearing", True)
     assert ate(got.pose, true)[0] < 0.05
-    assert np.mean(got.match[wrong] == -2) > 0.85
-    assert np.mean(got.match[data.measurements.valid & ~wrong] != -2) > 0.99
+    assert np.mean(got.landmark_id[wrong] == -2) > 0.85
+    assert np.mean(got.landmark_id[data.measurements.valid & ~wrong] != -2) > 0.99
     assert (data.identities[got.identity] == log.truth.landmark_id[got.identity]).all()
 
 
@@ -342,12 +342,12 @@ def test_nothing_to_go_by(sensor, kind):
     if kind == "padding":
         nothing = data.measurements._replace(valid=np.zeros((steps, 2), bool))
         data = data._replace(measurements=nothing)
-    birth = np.full((steps, 2), -3 if kind == "padding" else -2)
+    landmark_id = np.full((steps, 2), -3 if kind == "padding" else -2)
     params = params_of(sensor, outlier=0.01)
-    got = refine(data, pose, birth, np.zeros(3), np.diag([0.1, 0.1, 0.0]), params, sensor)
+    got = refine(data, pose, landmark_id, np.zeros(3), np.diag([0.1, 0.1, 0.0]), params, sensor)
     assert (len(got.mean), got.merged, got.converged) == (0, 0, True)
     np.testing.assert_allclose(got.pose, pose, atol=1e-6)
-    assert got.match.tolist() == birth.tolist()
+    assert got.landmark_id.tolist() == landmark_id.tolist()
     assert np.all(np.linalg.eigvalsh(got.cov) > 0)
 
 
@@ -368,7 +368,7 @@ def test_arrays_that_do_not_fit_are_refused():
     odometry, pose = drive(4, np.random.default_rng(0))
     data = as_frames(odometry, np.ones((4, 2, 2)))
     params = params_of("range_bearing")
-    with pytest.raises(ValueError, match=r"birth: shape \(4, 3\), must be \(4, 2\)"):
+    with pytest.raises(ValueError, match=r"landmark_id: shape \(4, 3\), must be \(4, 2\)"):
         refine(data, pose, np.full((4, 3), -1), np.zeros(3), None, params, "range_bearing")
     with pytest.raises(ValueError, match="pose: not all finite"):
         refine(data, pose * np.nan, np.full((4, 2), -1), np.zeros(3), None, params, "bearing")
@@ -395,7 +395,7 @@ def test_errors_that_stay_alike_count_less():
     for correlation in (0.0, 1.0):
         params = params_of("range_bearing", correlation=correlation, outlier=0.01)
         with jax.enable_x64(True):
-            given, _ = bundle.problem(data, np.zeros(3), None, params, "range_bearing")
+            given, _ = bundle.make_problem(data, np.zeros(3), None, params, "range_bearing")
         # A radian counts as a tenth of a metre.
         travel = odometry.distance + 0.1 * odometry.turn
         expected = np.tanh(travel / 2) if correlation else np.ones(6)

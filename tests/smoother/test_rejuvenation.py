@@ -11,8 +11,8 @@ from jaxslam import run
 from jaxslam.config import Config
 from jaxslam.filter import step
 from jaxslam.logs.odometry import Odometry
-from jaxslam.results.events import events
-from jaxslam.results.metrics import errors
+from jaxslam.results.events import list_events
+from jaxslam.results.metrics import compute_errors
 from jaxslam.runs import compiled
 from jaxslam.runs import run as runner
 from jaxslam.simulation.planar import planar
@@ -26,25 +26,27 @@ def odometry(distance):
 
 
 def test_it_is_due_after_metres_and_later_after_a_share_of_the_path():
-    assert rejuvenation.due(odometry([1.0] * 10), 3.0) == [3, 6, 9]
-    assert rejuvenation.due(odometry([1.0, 0.0, 0.0, 2.0, 5.0, 1.0]), 3.0) == [4, 5]
-    assert rejuvenation.due(odometry([1.0] * 10), 0.0) == []
-    times = rejuvenation.due(odometry([1.0] * 400), 3.0)
+    assert rejuvenation.due_frames(odometry([1.0] * 10), 3.0) == [3, 6, 9]
+    assert rejuvenation.due_frames(odometry([1.0, 0.0, 0.0, 2.0, 5.0, 1.0]), 3.0) == [4, 5]
+    assert rejuvenation.due_frames(odometry([1.0] * 10), 0.0) == []
+    times = rejuvenation.due_frames(odometry([1.0] * 400), 3.0)
     assert times[0] == 3 and times[-1] - times[-2] == np.ceil(rejuvenation.GROWTH * times[-2]) > 10
     # Never at the very end, where nothing would come of it.
-    assert rejuvenation.due(odometry([1.0, 1.0, 1.0]), 3.0) == []
+    assert rejuvenation.due_frames(odometry([1.0, 1.0, 1.0]), 3.0) == []
 
 
 @pytest.fixture(scope="module")
 def solved():
     """A refined past of bearings, and its problem."""
     log, data, params, true, _ = room("bearing", False)
-    birth, _ = births(log, data)
+    landmark_id, _ = births(log, data)
     with jax.enable_x64(True):
-        given, place = least_squares.problem(
+        given, place = least_squares.make_problem(
             data, log.start_pose, np.eye(3) * 1e-4, params, "bearing"
         )
-        found = refine.solved(given, place, true, birth.ravel()[place], False, again=True)
+        found = refine.solve_and_reassociate(
+            given, place, true, landmark_id.ravel()[place], False, again=True
+        )
     return given, found
 
 
@@ -84,7 +86,7 @@ def test_pose_and_points_are_those_of_the_whole_inverse(solved):
 def test_drawn_particles_have_the_moments_asked_for(sensor):
     config = Config(sensor=sensor, particles=40_000, landmarks=4, association="known")
     config = dataclasses.replace(config, forgetting=True)
-    joint, draw = posterior_sampling.nothing(4), np.random.default_rng(0)
+    joint, draw = posterior_sampling.empty_joint(4), np.random.default_rng(0)
     root = np.tril(0.02 * draw.normal(size=(7, 7))).astype(np.float32)
     index = np.array([0, 1, 2, 3, 4, 7, 8])  # slots 0 and 2
     joint.root[index[:, None], np.arange(7)] = root
@@ -102,8 +104,8 @@ def test_drawn_particles_have_the_moments_asked_for(sensor):
         (-0.3, 0.1),
         (0.1, 0, 0.2),
     )
-    joint.count[[0, 2, 3]], joint.birth[[0, 2, 3]] = (5, 6, 7), (10, 20, 30)
-    state = posterior_sampling.drawn(
+    joint.count[[0, 2, 3]], joint.landmark_id[[0, 2, 3]] = (5, 6, 7), (10, 20, 30)
+    state = posterior_sampling.draw_state(
         jax.random.key(1), joint._replace(used=np.int32(7)), 12, config
     )
     assert state.step == 12 and np.allclose(np.exp(state.log_weight).sum(), 1)
@@ -112,7 +114,7 @@ def test_drawn_particles_have_the_moments_asked_for(sensor):
     off = np.vstack([pose - joint.pose[:, None]])
     off[2] = (off[2] + np.pi) % (2 * np.pi) - np.pi
     assert world.count[:, 0].tolist() == [5, 0, 6, 7]
-    assert world.birth[:, 0].tolist() == [10, 0, 20, 30]
+    assert world.landmark_id[:, 0].tolist() == [10, 0, 20, 30]
     for slot in (0, 2):
         mean = world.mean[:, slot].astype(float)
         if sensor == "bearing":
@@ -155,7 +157,7 @@ def found(log):
 
 
 def test_hidden_bearings_become_the_map(log, found):
-    got = errors(found)
+    got = compute_errors(found)
     assert got["ate_refined_rmse_m"] < 0.05
     assert got["landmarks_refined_missed"] <= 1 and got["landmarks_refined_spurious"] <= 1
     assert got["association_accuracy"] > 0.9
@@ -168,7 +170,7 @@ def test_hidden_bearings_become_the_map(log, found):
 
 def test_events_say_what_became_of_the_map(found):
     done, kind, label, into = found.events.T
-    assert set(done) <= set(rejuvenation.due(runner.framed(
+    assert set(done) <= set(rejuvenation.due_frames(runner.frames_of(
         found.log, found.config, found.params).odometry, found.config.rejuvenate))  # fmt: skip
     held = set()
     for which, a, b in zip(kind, label, into, strict=True):
@@ -181,7 +183,7 @@ def test_events_say_what_became_of_the_map(found):
 def test_the_past_is_whole(found):
     frames = len(found.time)
     assert found.lineage.pose.shape == (frames, 3)
-    assert found.lineage.birth.shape == found.match.shape
+    assert found.lineage.landmark_id.shape == found.landmark_id.shape
     assert found.ancestral.pose.shape == (frames, 3)
     assert np.isfinite(found.ancestral.cov).all()
     assert (np.linalg.eigvalsh(found.ancestral.cov)[:, 0] > -1e-9).all()
@@ -199,25 +201,25 @@ def test_a_past_that_cannot_be_refined_stays(log, found, monkeypatch):
     def fail(*_, **__):
         raise np.linalg.LinAlgError("Matrix is not positive definite")
 
-    monkeypatch.setattr(refine, "solved", fail)
+    monkeypatch.setattr(refine, "solve_and_reassociate", fail)
     without = run(log, found.config, seed=1, refine=False)
     assert without.events[:, 1].tolist() == [FAILED] * len(without.events) != []
     assert any("could not be refined" in line for line in without.advice)
     monkeypatch.undo()
-    solved, times = refine.solved, []
+    solved, times = refine.solve_and_reassociate, []
 
     def fail_at_last(*given, **told):
         times.append(0)
         return (fail if len(times) == len(without.events) else solved)(*given, **told)
 
-    monkeypatch.setattr(refine, "solved", fail_at_last)
+    monkeypatch.setattr(refine, "solve_and_reassociate", fail_at_last)
     last = run(log, found.config, seed=1, refine=False)
     assert np.sum(last.events[:, 1] == FAILED) == 1
     assert last.ancestral.cov.shape == (len(last.time), 3, 3)
     monkeypatch.undo()
     plain = dataclasses.replace(found.config, rejuvenate=0.0)
     assert np.array_equal(without.pose, run(log, plain, seed=1, refine=False).pose)
-    assert {"failed": True} in [event.get("rejuvenated") for event in events(without)]
+    assert {"failed": True} in [event.get("rejuvenated") for event in list_events(without)]
 
 
 def same(one, other):
@@ -250,7 +252,7 @@ def test_it_goes_on_from_a_checkpoint_with_the_same_bits(log, found, tmp_path):
 
 def test_known_identities_can_be_rejuvenated(log):
     settings = SETTINGS | dict(association="known", landmarks=20, rejuvenate=3.0)
-    got = errors(run(log, runner.config_for(log, **settings), seed=2))
+    got = compute_errors(run(log, runner.config_for(log, **settings), seed=2))
     assert got["ate_refined_rmse_m"] < 0.05
     assert got["landmarks_refined_matched"] >= 19
 
@@ -259,7 +261,7 @@ def test_known_identities_can_be_rejuvenated(log):
 @pytest.mark.slow
 def test_points_can_be_rejuvenated(log, sensor):
     settings = SETTINGS | dict(sensor=sensor, rejuvenate=3.0)
-    got = errors(run(log, runner.config_for(log, **settings), seed=2))
+    got = compute_errors(run(log, runner.config_for(log, **settings), seed=2))
     assert got["ate_refined_rmse_m"] < 0.06
     assert got["landmarks_refined_missed"] <= 1
 

@@ -10,7 +10,7 @@ from jaxslam.logs.log import Log, Truth
 from jaxslam.logs.log_file import load_log, save_log
 from jaxslam.logs.odometry import Odometry, increments, moments
 from jaxslam.models import motion
-from jaxslam.reference.compare import select
+from jaxslam.reference.compare import select_frames
 from jaxslam.simulation import planar
 from jaxslam.vision.log_triangulation import PointSettings, triangulate_log
 from jaxslam.vision.triangulation import (
@@ -295,7 +295,7 @@ def test_bad_requests_are_named():
 def test_the_bundled_log_gets_points():
     """The paper's way on a real robot: a fifth of the log, identities hidden."""
     log = load_log("lost-in-the-woods")
-    log = select(log, np.arange(0, 2500, 2))
+    log = select_frames(log, np.arange(0, 2500, 2))
     found = triangulate_log(log)
     moved = increments(found).distance.sum()
     given = np.isfinite(found.point[:, 0])

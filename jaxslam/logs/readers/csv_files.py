@@ -21,14 +21,14 @@ import numpy as np
 
 from jaxslam.logs.log import Log, Truth
 from jaxslam.logs.readers.text_table import (
+    drop_bad_rows,
+    drop_rows,
     in_order,
     parse,
     pose_at,
     read_lines,
-    settle,
-    whole,
-    without,
-    wrapped,
+    to_integers,
+    wrap_bearings,
 )
 
 VELOCITY = ("forward_m_s", "yaw_rate_rad_s")
@@ -74,7 +74,7 @@ def read_csv(paths, view=None, mounting=(0.0, 0.0, 0.0)):
     looks = [name.startswith(LOOK) for name in columns]
     bearing, distance = column.get("bearing_rad"), column.get("range_m")
     if bearing is not None:
-        bearing = wrapped(bearing)
+        bearing = wrap_bearings(bearing)
     truth = _truth(files, skipped)
     start = min(odometry.time.min(), frame_time[0])
     known = truth is not None and truth.time is not None
@@ -171,8 +171,8 @@ def _odometry(file, skipped):
     velocity = file[1][1:] == VELOCITY
     limit = MOST_YAW_RATE if velocity else 2 * pi
     reason = f"turn beyond {limit:.1f} rad{'/s' * velocity} (degrees? multiply by pi/180)"
-    table = without(table, np.abs(table.value[:, 1]) > limit, reason, unit=True)
-    return "velocity" if velocity else "command", settle(table, skipped)
+    table = drop_rows(table, np.abs(table.value[:, 1]) > limit, reason, unit=True)
+    return "velocity" if velocity else "command", drop_bad_rows(table, skipped)
 
 
 def _measurements(file, skipped):
@@ -181,23 +181,23 @@ def _measurements(file, skipped):
     needed = [name != "identity" for name in columns]
     blank = np.isnan(table.value)
     partly = ~blank.all(axis=1) & blank[:, needed].any(axis=1)
-    table = without(table, partly, "a measurement with empty cells")
+    table = drop_rows(table, partly, "a measurement with empty cells")
     if "identity" in columns:
         number = table.value[:, columns.index("identity")]
-        wrong = ~np.isnan(number) & (~whole(number) | (number < -1))
-        table = without(table, wrong, "identity is not a whole number from -1")
+        wrong = ~np.isnan(number) & (~to_integers(number) | (number < -1))
+        table = drop_rows(table, wrong, "identity is not a whole number from -1")
     beyond = np.abs(table.value) > np.finfo(np.float32).max
-    table = without(table, beyond.any(axis=1), "a number too large")
+    table = drop_rows(table, beyond.any(axis=1), "a number too large")
     if "bearing_rad" in columns:
         reason = "bearing beyond 2 pi rad (degrees? multiply by pi/180)"
-        table = without(table, np.abs(table.value[:, 0]) > 2 * pi, reason, unit=True)
+        table = drop_rows(table, np.abs(table.value[:, 0]) > 2 * pi, reason, unit=True)
     if "range_m" in columns:
-        table = without(table, table.value[:, 1] <= 0, "range not above 0 m")
+        table = drop_rows(table, table.value[:, 1] <= 0, "range not above 0 m")
     if "sxx" in columns:
         xx, xy, yy = table.value[:, 2:5].T
         indefinite = (xx <= 0) | (yy <= 0) | (xx * yy <= xy * xy)
-        table = without(table, indefinite, "covariance is not positive definite")
-    table = settle(table, skipped)
+        table = drop_rows(table, indefinite, "covariance is not positive definite")
+    table = drop_bad_rows(table, skipped)
     order = in_order(table.time, "measurement", skipped, unique=False)
     return columns, table._replace(time=table.time[order], value=table.value[order])
 
@@ -216,12 +216,12 @@ def _view(value, bearing, distance):
 def _truth(files, skipped):
     known = {}
     if "truth" in files:
-        table = settle(_parse(files["truth"]), skipped)
+        table = drop_bad_rows(_parse(files["truth"]), skipped)
         order = in_order(table.time, "truth row", skipped)
         known = {"time": table.time[order], "pose": table.value[order]}
     if "landmarks" in files:
         table = _parse(files["landmarks"], stamped=False)
-        table = without(table, ~whole(table.value[:, 0]), "id is not a whole number")
-        table = settle(table, skipped)
+        table = drop_rows(table, ~to_integers(table.value[:, 0]), "id is not a whole number")
+        table = drop_bad_rows(table, skipped)
         known |= {"landmarks": table.value[:, 1:], "landmark_id": table.value[:, 0].astype(int)}
     return Truth(**known) if known else None

@@ -7,14 +7,14 @@ import numpy as np
 
 from jaxslam.logs.log import NOT_USED, Log, Truth
 from jaxslam.logs.readers.text_table import (
+    drop_bad_rows,
+    drop_rows,
     in_order,
     parse,
     pose_at,
     read_lines,
-    settle,
-    whole,
-    without,
-    wrapped,
+    to_integers,
+    wrap_bearings,
 )
 
 ROBOTS = 5  # subjects 1-5 are robots, those above landmarks
@@ -72,8 +72,8 @@ def _table(path, width, skipped, ids=0):
     """Rows that begin with a stamp, or with `ids` whole numbers."""
     lines, complete = read_lines(path)
     table = parse(path, lines, width, complete, stamped=not ids)
-    wrong = ~whole(table.value[:, :ids]).all(axis=1)
-    return settle(without(table, wrong, "number is not whole"), skipped)
+    wrong = ~to_integers(table.value[:, :ids]).all(axis=1)
+    return drop_bad_rows(drop_rows(table, wrong, "number is not whole"), skipped)
 
 
 def _measurements(path, skipped):
@@ -82,14 +82,14 @@ def _measurements(path, skipped):
     table = parse(path, lines, 4, complete)
     code, distance, bearing = table.value.T
     degrees = np.abs(bearing) > 2 * np.pi
-    table = without(table, degrees, "bearing beyond 2 pi rad (degrees? times pi/180)", unit=True)
+    table = drop_rows(table, degrees, "bearing beyond 2 pi rad (degrees? times pi/180)", unit=True)
     code, distance, bearing = table.value.T
-    wrong = (distance <= 0) | ~whole(code)
-    table = without(table, wrong, "range not above 0 m, or barcode not a whole number")
-    table = settle(table, skipped)
+    wrong = (distance <= 0) | ~to_integers(code)
+    table = drop_rows(table, wrong, "range not above 0 m, or barcode not a whole number")
+    table = drop_bad_rows(table, skipped)
     order = in_order(table.time, "measurement", skipped, unique=False)
     value = table.value[order]
-    value[:, 2] = wrapped(value[:, 2])
+    value[:, 2] = wrap_bearings(value[:, 2])
     return table._replace(line=table.line[order], time=table.time[order], value=value)
 
 

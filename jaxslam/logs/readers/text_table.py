@@ -101,7 +101,7 @@ def _number(text, blanks):
     return value
 
 
-def without(table, wrong, reason, unit=False):
+def drop_rows(table, wrong, reason, unit=False):
     """The table without the rows that are `wrong`; two rows of a wrong `unit` are an error."""
     lines = table.line[wrong]
     if unit and len(lines) > 1:
@@ -110,12 +110,12 @@ def without(table, wrong, reason, unit=False):
     return Table(table.path, table.line[~wrong], table.time[~wrong], table.value[~wrong], bad)
 
 
-def whole(values):
+def to_integers(values):
     """Mask of the numbers that are whole, and small enough to be meant as such."""
     return (values == np.round(values)) & (np.abs(values) < 2**53)
 
 
-def settle(table, skipped):
+def drop_bad_rows(table, skipped):
     """Count the bad rows in `skipped`; raise when they are too many or nothing is left."""
     bad = sorted(table.bad)
     rows = len(table.line) + len(bad)
@@ -150,7 +150,7 @@ def in_order(time, what, skipped, unique=True):
     return order[last]
 
 
-def wrapped(angle):
+def wrap_bearings(angle):
     """Angles in [-pi, pi]; those that are there already stay as they are."""
     return angle - 2 * np.pi * np.round(angle / (2 * np.pi))
 

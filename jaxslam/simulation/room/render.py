@@ -16,7 +16,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from jaxslam.files import beside, move_folder
+from jaxslam.files import move_folder, temporary_sibling
 from jaxslam.simulation.room.furniture import furnish
 from jaxslam.simulation.room.geometry import VIEW, eye_at, visible_edges
 from jaxslam.simulation.room.raycast import camera_rays, expose, scene
@@ -171,7 +171,7 @@ def render_room(
     )
     world = furnish(seed, shadows=shadows, plain=plain)
     target = _target(out, overwrite)
-    partial = beside(target)
+    partial = temporary_sibling(target)
     try:
         (partial / "images").mkdir(parents=True)
         _write(partial, world, driven, camera, effects, seed, progress)
