@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.likelihood import maximum_likelihood
-from jaxslam.config import default_params
 from jaxslam.logs.odometry import increments
 from jaxslam.logs.truth import truth_at, wrap
+from jaxslam.parameters import default_params
 
 LEAST = 30  # measurements, and intervals of odometry, below which nothing is estimated
 GAP = 0.25  # s between two true poses, across which a pose may be interpolated

@@ -58,7 +58,7 @@ class ErrorModel:
 def fit(log, interval=1.0):
     """`ErrorModel` of a log with truth.
 
-    Sensor: `sigma_range` (about zero; where there are ranges), `sigma_bearing`, `growth`,
+    Sensor: `sigma_range` (about zero; where there are ranges), `sigma_bearing`, `landmark_extent`,
     `mount_yaw`, and `outlier`: the share beyond 5 robust standard deviations of their range bin, or
     of no landmark by the truth. Odometry, in intervals of about `interval` seconds: `err_tran`,
     `err_rot`, `err_drift`, `gain_tran`, `gain_rot`, `bias_drift`, those of turns only if there are
@@ -105,9 +105,11 @@ def _fit_sensor(log):
     )
     counts = {"measurements": len(r) + clutter, "outliers": int(far.sum()) + clutter}
     share = counts["outliers"] / counts["measurements"]
-    values = dict(zip(("mount_yaw", "sigma_bearing", "growth"), best, strict=True), outlier=share)
+    values = dict(
+        zip(("mount_yaw", "sigma_bearing", "landmark_extent"), best, strict=True), outlier=share
+    )
     values["mount_yaw"] = log.mounting[2] - best[0]  # a sensor turned to the left reads too little
-    errors = dict(zip(("mount_yaw", "sigma_bearing", "growth"), error, strict=True))
+    errors = dict(zip(("mount_yaw", "sigma_bearing", "landmark_extent"), error, strict=True))
     errors["outlier"] = np.sqrt(share * (1 - share) / counts["measurements"])
     if log.range is not None:
         values["sigma_range"] = np.sqrt(np.mean(off**2))

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from calibration.odometry import ODOMETRY
 from calibration.points import Model, PointErrors, compare, coverage, identified, point_errors
 from calibration.sensor import ErrorModel, fit
-from jaxslam.config import UNITS, Params
 from jaxslam.logs.truth import truth_at
+from jaxslam.parameters import TABLE, Params
 from jaxslam.plotting import FILTER, LANDMARK, STYLE, TRUE, ellipses, write_figure
 
 SHOWN = 250  # points drawn at most: more would cover each other
@@ -71,7 +71,7 @@ def text(report):
     lines = [f"{'parameter':<16}{'value':>11}{'std. error':>12}  unit"]
     for name, value in found.items():
         error = f"{errors[name]:.2g}" if name in errors else ""
-        lines.append(f"{name:<16}{value:>11.5g}{error:>12}  {UNITS[name]}")
+        lines.append(f"{name:<16}{value:>11.5g}{error:>12}  {TABLE[name].unit}")
     if report.models:
         lines += ["", _counted(report.errors), ""]
         lines.append(f"{'error model of a point':<24}{'nats/point':>11}{'in 95 %':>9}  parameters")

@@ -19,14 +19,14 @@ from jaxslam.results.metrics import compute_errors
 RESULTS = Path(__file__).parent / "results"
 # the motion and the bearing noise of the version before
 FORMER_MOTION = dict(err_tran=0.04, err_rot=0.05, err_drift=0.05, floor_tran=0.002)
-FORMER_NOISE = dict(sigma_bearing=0.1, growth=0.02, caution=0.0, outlier=1e-3)
+FORMER_NOISE = dict(sigma_bearing=0.1, landmark_extent=0.02, extra_bearing_noise=0.0, outlier=1e-3)
 ROWS = (
     ("the defaults", {}, {}),
     ("the motion noise of the version before", {}, FORMER_MOTION),
     ("the bearing noise of the version before", {}, FORMER_NOISE),
     ("both of the version before", {}, FORMER_MOTION | FORMER_NOISE),
-    ("no caution", {}, {"caution": 0.0}),
-    ("no growth at short range", {}, {"growth": 0.0}),
+    ("no caution", {}, {"extra_bearing_noise": 0.0}),
+    ("no growth at short range", {}, {"landmark_extent": 0.0}),
     ("errors alike over 2 cm of path", {}, {"correlation": 0.02}),
     ("no outliers", {"clutter": False}, {}),
     ("informed proposal", {"proposal": "informed"}, {}),

@@ -31,7 +31,7 @@ from jaxslam.models.motion import model
 from jaxslam.results.metrics import align_se2, ate, has_truth, map_error, relative_pose
 
 HERE = Path(__file__).parent
-NOISES = ("sigma_bearing", "growth", "err_tran", "err_rot", "err_drift", "floor_tran")
+NOISES = ("sigma_bearing", "landmark_extent", "err_tran", "err_rot", "err_drift", "floor_tran")
 NOISES += ("floor_rot", "outlier", "correlation", "mount_yaw", "gain_rot", "gain_tran")
 RESULTS, PARAMS = HERE / "results", HERE / "params"
 MRCLAM = HERE.parents[1] / "shared" / "data" / "mrclam" / "MRCLAM_Dataset6"
@@ -193,7 +193,7 @@ def bearing_noise(odometry, params):
     ones = np.ones(len(odometry.dx))
     return (
         np.asarray(inflated.sigma_bearing, float) ** 2 * ones,
-        np.asarray(inflated.growth, float) ** 2 * ones,
+        np.asarray(inflated.landmark_extent, float) ** 2 * ones,
     )
 
 

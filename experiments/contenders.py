@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import vectorised_numpy
 
-from jaxslam.config import Params, default_params
 from jaxslam.filter import step as fastslam
 from jaxslam.models.motion import Odometry
 from jaxslam.models.sensors import Measurements
+from jaxslam.parameters import Params, default_params
 from jaxslam.reference import ekf
 from jaxslam.reference import fastslam as baseline
 from jaxslam.runs import memory
@@ -24,7 +24,7 @@ from jaxslam.runs import memory
 DRIVE = Odometry(0.1, 0.0, 0.01, 0.1, 0.01, 0.2, 0.5, 1 / 12)  # 0.1 m and 0.01 rad in 0.2 s
 KNOWN_TO = 0.05  # m, standard deviation of the given map
 PARAMS = default_params("range_bearing")._replace(
-    sigma_range=0.1, sigma_bearing=float(np.deg2rad(1)), growth=0.0, view_range=12.0
+    sigma_range=0.1, sigma_bearing=float(np.deg2rad(1)), landmark_extent=0.0, view_range=12.0
 )
 SIDE = 40  # of the largest map, in landmarks
 LOOP_PARTICLES = 4

@@ -23,10 +23,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.config import Config, default_params
+from jaxslam.config import Config
 from jaxslam.learning import likelihood
 from jaxslam.logs.odometry import Odometry
 from jaxslam.models.sensors import Measurements
+from jaxslam.parameters import default_params
 from jaxslam.simulation.planar import planar
 
 RESULTS = Path(__file__).parent / "results"
@@ -34,7 +35,7 @@ NAMES = ("err_tran", "floor_tran", "gain_tran", "position_scale")
 ESTIMATORS = (("fisher", 0.97), ("fisher", 0.9), ("fisher", 1.0), ("pathwise", 1.0), ("plain", 1.0))
 PARAMS = default_params("position")._replace(
     err_tran=0.1, floor_tran=0.05, gain_tran=1.0, err_rot=0.0, err_drift=0.0, floor_rot=0.0,
-    correlation=0.0, caution=0.0, density_new=0.1,
+    correlation=0.0, extra_bearing_noise=0.0, density_new=0.1,
 )  # fmt: skip
 STEPS, MARKS, MOST, RADIUS, SIGHT, NOISE = 200, 20, 6, 4.0, 5.0, 0.2  # m
 DRIVE = 0.3  # m between frames

@@ -26,9 +26,9 @@ import jax
 import numpy as np
 from scipy.stats import chi2, truncnorm
 
-from jaxslam.config import default_params
 from jaxslam.filter import landmarks
 from jaxslam.models import sensors
+from jaxslam.parameters import default_params
 
 RESULTS = Path(__file__).parent / "results"
 STEP, CHECKS = 0.1, (1, 3, 10, 20, 40)  # m; frames at which all is measured
@@ -58,7 +58,7 @@ def wrap(angle):
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def observe(phi, rho, x, sigma, growth):
+def observe(phi, rho, x, sigma, landmark_extent):
     """Bearing, its two derivatives, second derivative by rho, and variance; sensor at (x, 0)."""
     c, s = np.cos(phi), np.sin(phi)
     dx, dy = c - rho * x, s
@@ -66,7 +66,13 @@ def observe(phi, rho, x, sigma, growth):
     w = s * x
     second = 2 * w * x * dx / square**2
     by_phi = (dy * s + dx * c) / square
-    return np.arctan2(dy, dx), by_phi, w / square, second, sigma**2 + (growth * rho) ** 2 / square
+    return (
+        np.arctan2(dy, dx),
+        by_phi,
+        w / square,
+        second,
+        sigma**2 + (landmark_extent * rho) ** 2 / square,
+    )
 
 
 def log_normal(nu, variance):
@@ -148,7 +154,7 @@ def split(mean, cov, x, z, noise, part=ekf, nodes=3, share=0.5):
 
 
 def shipped(mean, cov, x, z, noise):
-    numbers = PRIOR._replace(sigma_bearing=noise[0], growth=noise[1])
+    numbers = PRIOR._replace(sigma_bearing=noise[0], landmark_extent=noise[1])
     l11 = np.sqrt(cov[0])
     factor = l11, cov[1] / l11, np.sqrt(cov[2] - cov[1] ** 2 / cov[0])
     zero = np.zeros_like(z)
@@ -187,15 +193,15 @@ METHODS = {
 
 def draw(case, count, rng):
     """Truth [2, D], and bearings [frames, D] that follow the first."""
-    _, first, sigma, growth, depth = case
+    _, first, sigma, landmark_extent, depth = case
     first, sigma = np.deg2rad(first), np.deg2rad(sigma)
     m, sd = PRIOR.inv_depth_mean, PRIOR.inv_depth_sd
     low = (sensors.LEAST_INVERSE_DEPTH - m) / sd
     rho = truncnorm.rvs(low, np.inf, m, sd, size=count, random_state=rng)
     rho = rho if depth is None else np.full(count, 1 / depth)
-    phi = first + rng.normal(size=count) * np.hypot(sigma, growth * rho)
+    phi = first + rng.normal(size=count) * np.hypot(sigma, landmark_extent * rho)
     x = STEP * np.arange(1, CHECKS[-1] + 2)[:, None]
-    h, *_, variance = observe(phi, rho, x, sigma, growth)
+    h, *_, variance = observe(phi, rho, x, sigma, landmark_extent)
     return np.stack([phi, rho]), wrap(h + rng.normal(size=h.shape) * np.sqrt(variance))
 
 

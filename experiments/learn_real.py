@@ -36,14 +36,14 @@ from jaxslam.results.metrics import compute_errors
 RESULTS = Path(__file__).parent / "results"
 PARAMS = Path(__file__).parent / "params"
 NAMES = ("err_tran", "err_rot", "err_drift", "floor_tran", "floor_rot", "gain_tran", "gain_rot")
-NAMES += ("mount_yaw", "sigma_range", "sigma_bearing", "growth", "outlier")
+NAMES += ("mount_yaw", "sigma_range", "sigma_bearing", "landmark_extent", "outlier")
 # Commanded drives bend to one side; where the camera looks is each robot's own; and what a glimpse
 # of one or two landmarks every 3 s leaves open is not asked.
 LEFT = ("mount_yaw", "floor_tran", "floor_rot")
 CURVED = (*(name for name in NAMES if name not in LEFT), "bias_drift")
 # The course's standard deviations of speed and yaw rate, every 0.1 s, as noise per time.
 WOODS_PUBLISHED = dict(
-    sigma_range=0.030, sigma_bearing=0.0259, growth=0.0, floor_tran=0.0665 * 0.1**0.5,
+    sigma_range=0.030, sigma_bearing=0.0259, landmark_extent=0.0, floor_tran=0.0665 * 0.1**0.5,
     floor_rot=0.0905 * 0.1**0.5, err_tran=0.0, err_rot=0.0, err_drift=0.0,
 )  # fmt: skip
 KEYS = ("ate_filtered_rmse_m", "landmark_filtered_rmse_m", "ate_refined_rmse_m")

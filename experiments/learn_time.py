@@ -17,10 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-from jaxslam.config import Config, Params, default_params
+from jaxslam.config import Config
 from jaxslam.filter.frames import frames_from_log
 from jaxslam.learning import fit as learn
 from jaxslam.learning import likelihood, transforms
+from jaxslam.parameters import Params, default_params
 from jaxslam.reference import compare, fastslam
 from jaxslam.simulation import planar
 

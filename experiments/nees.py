@@ -31,11 +31,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2
 
-from jaxslam.config import Config, Params, default_params
+from jaxslam.config import Config
 from jaxslam.filter import map_estimate
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.truth import wrap
+from jaxslam.parameters import Params, default_params
 from jaxslam.simulation.planar import planar
 from jaxslam.smoother.genealogy import Tree, trace_lineage
 from jaxslam.smoother.refine import refine
@@ -88,7 +89,7 @@ def simulated(given, seed):
         sigma_range=given["noise"][0], sigma_bearing=given["noise"][1], view=given["view"],
         max_per_frame=MOST, closed_loop=given["closed_loop"],
     )  # fmt: skip
-    params = default_params(given["sensor"], log)._replace(correlation=0.0, caution=0.0)
+    params = default_params(given["sensor"], log)._replace(correlation=0.0, extra_bearing_noise=0.0)
     if not given["declared_density"]:
         params = params._replace(density_new=default_params().density_new)
     return (
@@ -213,7 +214,9 @@ def one_refined(given, config, seed):
     mean, cov = table.mean[:, keep].T + origin[:2], table.cov[:, keep].T
     marks, *lost = map_squares(mean, cov, past.landmark_id, table.landmark_id[keep], data, log)
     filter_ = *pose_squares(estimate.mean + origin, estimate.cov, log), marks, *lost
-    marks, *lost = map_squares(found.mean, found.landmark_cov, found.landmark_id, found.id, data, log)
+    marks, *lost = map_squares(
+        found.mean, found.landmark_cov, found.landmark_id, found.id, data, log
+    )
     refined_ = *pose_squares(found.pose, found.cov, log), marks, *lost
     return filter_, refined_, (middle - begin, end - middle), found.converged
 

@@ -36,7 +36,7 @@ def world(seed):
     """A room of its own for every seed."""
     return planar(
         "room", 5000 + seed, landmarks=20, length_m=60.0, speed=0.5, rate_hz=5, odometry_hz=5,
-        sigma_range=0.1, sigma_bearing=0.0175, growth=0.0, outlier=0.0, detection=1.0,
+        sigma_range=0.1, sigma_bearing=0.0175, landmark_extent=0.0, outlier=0.0, detection=1.0,
         view=(-np.pi, np.pi, 6.0),
     )  # fmt: skip
 

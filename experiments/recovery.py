@@ -26,9 +26,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxslam.config import Config, Params, default_params
+from jaxslam.config import Config
 from jaxslam.files import atomic_write
 from jaxslam.learning import fit, likelihood, transforms, uncertainty
+from jaxslam.parameters import TABLE, Params, default_params
 from jaxslam.simulation import planar
 
 RESULTS = Path(__file__).parent / "results"
@@ -68,7 +69,7 @@ def problem(case, count):
     hidden = association == "sampled"
     config = Config(
         sensor=sensor, association=association, proposal="informed", particles=200, measurements=8,
-        landmarks=32 if hidden else 20, even=hidden,
+        landmarks=32 if hidden else 20, uniform_association_prior=hidden,
     )  # fmt: skip
     # Without any clutter one landmark that a filter lost would outweigh all else.
     outlier = 0.01 if hidden else 1e-3
@@ -78,9 +79,7 @@ def problem(case, count):
             [[float(transforms.to_free(n, v)) for n, v in zip(names, t, strict=True)]
              for _, t, _ in worlds]
         )  # fmt: skip
-    off = np.where(
-        [name.startswith("gain") for name in names], 0.2 / transforms.SCALE["gain_rot"], 1.0
-    )
+    off = np.where([name.startswith("gain") for name in names], 0.2 / TABLE["gain_rot"].step, 1.0)
     return (
         fit.stack_logs(logs, config, params),
         config,

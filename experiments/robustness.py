@@ -19,7 +19,15 @@ from jaxslam import config_for, default_params, load_log, run
 from jaxslam.results.metrics import compute_errors
 
 RESULTS = Path(__file__).parent / "results"
-NOISES = ("sigma_bearing", "growth", "correlation", "outlier", "err_tran", "err_rot", "err_drift")
+NOISES = (
+    "sigma_bearing",
+    "landmark_extent",
+    "correlation",
+    "outlier",
+    "err_tran",
+    "err_rot",
+    "err_drift",
+)
 NOISES += ("floor_tran", "floor_rot")
 COLUMNS = ("ate_filtered_rmse_m", "ate_refined_rmse_m", "landmark_refined_rmse_m")
 

@@ -19,9 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.config import Config, Params, default_params
+from jaxslam.config import Config
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.frames import frames_from_log
+from jaxslam.parameters import Params, default_params
 from jaxslam.simulation.planar import planar
 
 RESULTS = Path(__file__).parent / "results"

@@ -12,8 +12,8 @@ import importlib
 
 _WHERE = {
     "Config": "config",
-    "Params": "config",
-    "default_params": "config",
+    "Params": "parameters",
+    "default_params": "parameters",
     "load_params": "parameter_file",
     "save_params": "parameter_file",
     "Log": "logs.log",

@@ -17,45 +17,9 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxslam.config import UNITS, Params
 from jaxslam.files import atomic_write
+from jaxslam.parameters import FORMER_NAMES, PARAMETERS, TABLE, Params, current_names
 
-MEANING = {
-    "err_tran": "noise along the path, per distance",
-    "err_rot": "noise of the heading, per turn",
-    "err_drift": "noise of the heading, per distance",
-    "floor_tran": "noise of the position, per time",
-    "floor_rot": "noise of the heading, per time",
-    "gain_tran": "true over measured distance",
-    "gain_rot": "true over measured turn",
-    "bias_drift": "systematic turn, per distance",
-    "sigma_range": "noise of a range",
-    "sigma_bearing": "noise of a bearing, far away",
-    "growth": "sideways noise of what is seen: it has a size",
-    "position_scale": "multiplies the standard deviations of positions",
-    "correlation": "path over which errors stay alike",
-    "caution": "bearing noise that the filter adds",
-    "mount_x": "sensor on the robot, forward",
-    "mount_y": "sensor on the robot, left",
-    "mount_yaw": "sensor on the robot, counter-clockwise",
-    "outlier": "that a measurement comes from nothing",
-    "density_new": "landmarks to be expected",
-    "detection": "that a landmark at range 0 is seen",
-    "view_min": "least bearing the sensor sees",
-    "view_max": "largest bearing the sensor sees",
-    "view_range": "largest range the sensor sees",
-    "inv_depth_mean": "inverse depth of a new landmark (bearing only)",
-    "inv_depth_sd": "its standard deviation",
-    "existence_new": "existence of a new landmark",
-    "existence_seen": "added when it is seen",
-    "existence_miss": "weight of not seeing what was expected",
-    "existence_max": "existence at most",
-    "existence_confirm": "from here on it is in the map",
-}
-ABOVE_ZERO = ("gain_tran", "gain_rot", "sigma_range", "sigma_bearing", "position_scale")
-ABOVE_ZERO += ("density_new", "view_range", "inv_depth_mean", "inv_depth_sd", "existence_max")
-AT_LEAST_ZERO = ("err_tran", "err_rot", "err_drift", "floor_tran", "floor_rot", "growth")
-AT_LEAST_ZERO += ("correlation", "caution", "existence_seen", "existence_miss")
 ERRORS = "standard_error"
 LEARN, BOUNDS, PRIOR = "learn", "bounds", "prior"
 PAIRS = {BOUNDS: "[lowest, highest]", PRIOR: "[value, standard deviation]"}
@@ -84,21 +48,30 @@ def validate(params, where):
     return Params(**values)
 
 
-def _ranges(v):
+def _ranges(values):
     """For each bounded name: whether its value is allowed, and what is."""
-    ranges = {name: (v[name] > 0, f"above 0 {UNITS[name]}") for name in ABOVE_ZERO}
-    ranges |= {name: (v[name] >= 0, f"0 {UNITS[name]} or more") for name in AT_LEAST_ZERO}
-    low, high, pi = v["view_min"], v["view_max"], math.pi + 1e-6  # float32 rounds it up
-    most = v["existence_max"]
+    ranges = {row.name: _range(row, values[row.name]) for row in PARAMETERS if row.low > -math.inf}
+    low, high, pi = values["view_min"], values["view_max"], math.pi + 1e-6  # float32 rounds it up
+    most = values["existence_max"]
+    new, confirm = values["existence_new"], values["existence_confirm"]
     return ranges | {
-        "outlier": (0 <= v["outlier"] < 1, "a probability, from 0 to below 1"),
-        "detection": (0 <= v["detection"] <= 1, "a probability, from 0 to 1"),
         "view_min": (-pi <= low < high, f"from -pi to below view_max, {high:g} rad"),
         "view_max": (low < high <= pi, f"above view_min, {low:g} rad, and at most pi"),
         # Below zero a landmark would be forgotten in the frame it was born in.
-        "existence_new": (0 <= v["existence_new"] <= most, f"from 0 to existence_max, {most:g}"),
-        "existence_confirm": (v["existence_confirm"] <= most, f"at most existence_max, {most:g}"),
+        "existence_new": (0 <= new <= most, f"from 0 to existence_max, {most:g}"),
+        "existence_confirm": (confirm <= most, f"at most existence_max, {most:g}"),
     }
+
+
+def _range(row, value):
+    """Whether a value is in the range of its row, and the range in words."""
+    good = row.low < value if row.above_low else row.low <= value
+    if row.high < math.inf:
+        below = "below " if row.below_high else ""
+        good = good and (value < row.high if row.below_high else value <= row.high)
+        return good, f"a {row.unit}, from {row.low:g} to {below}{row.high:g}"
+    words = f"above {row.low:g} {row.unit}" if row.above_low else f"{row.low:g} {row.unit} or more"
+    return good, words
 
 
 def load_params(path, base):
@@ -127,6 +100,11 @@ def _load(path, base):
     table = _read(Path(path))
     errors, learn = (_table(path, table, part) for part in (ERRORS, LEARN))
     pairs = {part: _table(path, table, part) for part in PAIRS}
+    table, errors, pairs = (
+        _current(path, table),
+        _current(path, errors),
+        {part: _current(path, names) for part, names in pairs.items()},
+    )
     for place, names in (("", table), (f"{ERRORS}.", errors)):
         for name, value in names.items():
             _check_name(path, place, name)
@@ -138,6 +116,14 @@ def _load(path, base):
             _check_name(path, f"{part}.", name)
             pairs[part] = pairs[part] | {name: _pair(path, part, name, value, params)}
     return Learning(params, _names(path, learn), pairs[BOUNDS], pairs[PRIOR])
+
+
+def _current(path, names):
+    """A table with names of version 0.1 replaced; `ValueError` where both stand."""
+    for former, name in FORMER_NAMES.items():
+        if former in names and name in names:
+            raise ValueError(f"{path}: {former} is the former name of {name}; give one of them")
+    return current_names(names)
 
 
 def _table(path, table, part):
@@ -159,6 +145,7 @@ def _names(path, learn):
     if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
         wanted = '["err_rot", "err_drift"]'
         raise ValueError(f"{path}: {LEARN}.parameters is {names!r}; must be names, like {wanted}")
+    names = [FORMER_NAMES.get(name, name) for name in names]
     for name in names:
         _check_name(path, f"{LEARN}.parameters: ", name)
     if len(set(names)) < len(names):
@@ -196,7 +183,7 @@ def save_params(path, params, standard_errors=None, learning=None):
     """
     path = Path(path)
     values = validate(params, path)._asdict()
-    lines = [f"{f'{name} = {value!r}':36}  # {UNITS[name]}, {MEANING[name]}\n"
+    lines = [f"{f'{name} = {value!r}':36}  # {TABLE[name].unit}, {TABLE[name].meaning}\n"
              for name, value in values.items()]  # fmt: skip
     if standard_errors:
         lines.append(f"\n[{ERRORS}]\n")

@@ -6,8 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from jaxslam.config import ASSOCIATIONS, PROPOSALS, SENSORS, UNITS, Config, Params, default_params
+from jaxslam.config import ASSOCIATIONS, PROPOSALS, SENSORS, Config
 from jaxslam.logs.log import Log
+from jaxslam.parameters import FORMER_NAMES, PARAMETERS, Params, default_params
 
 
 def make_log(**changes):
@@ -40,7 +41,7 @@ def test_defaults():
         "clutter": True,
         "forgetting": True,
         "proposal": "prior",
-        "even": False,
+        "uniform_association_prior": False,
         "rejuvenate": 0.0,
         "descriptors": 0,
     }
@@ -56,9 +57,11 @@ def test_only_hidden_bearings_are_rejuvenated_unasked():
 
 
 def test_even_is_for_sampled_associations():
-    assert Config(association="sampled", even=True).even
-    with pytest.raises(ValueError, match="even: is for association sampled, not known"):
-        Config(association="known", even=True)
+    assert Config(association="sampled", uniform_association_prior=True).uniform_association_prior
+    with pytest.raises(
+        ValueError, match="uniform_association_prior: is for association sampled, not known"
+    ):
+        Config(association="known", uniform_association_prior=True)
 
 
 def test_the_papers_preset_field_by_field():
@@ -74,7 +77,7 @@ def test_the_papers_preset_field_by_field():
         "clutter": False,
         "forgetting": False,
         "proposal": "prior",
-        "even": False,
+        "uniform_association_prior": False,
         "rejuvenate": 0.0,
         "descriptors": 0,
     }
@@ -145,9 +148,26 @@ def test_equal_settings_are_one_key_for_the_compiler():
         Config().particles = 3
 
 
-def test_every_parameter_has_a_unit_and_every_unit_a_parameter():
-    assert tuple(UNITS) == Params._fields
-    assert all(UNITS.values())
+def test_the_table_has_a_row_for_every_parameter():
+    assert tuple(row.name for row in PARAMETERS) == Params._fields
+    assert all(row.unit and row.meaning for row in PARAMETERS)
+    for row in PARAMETERS:
+        assert row.low <= row.default <= row.high, row.name
+        assert row.scale in ("log", "logit", "linear"), row.name
+        assert set(row.of_sensor) <= set(SENSORS), row.name
+        assert set(row.learned_by) <= {"motion", "alternatives", *SENSORS}, row.name
+    assert FORMER_NAMES == {"growth": "landmark_extent", "caution": "extra_bearing_noise"}
+
+
+def test_parameters_are_read_by_their_former_names():
+    params = default_params("bearing")
+    assert (params.growth, params.caution) == (0.03, 0.06)
+    log = make_log(noise={"growth": 0.2, "caution": 0.3})
+    told = default_params("bearing", log)
+    assert (told.landmark_extent, told.extra_bearing_noise) == (0.2, 0.3)
+    assert Config.from_dict({"association": "sampled", "even": True}) == Config(
+        association="sampled", uniform_association_prior=True
+    )
 
 
 @pytest.mark.parametrize("sensor", SENSORS)

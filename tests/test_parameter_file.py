@@ -6,15 +6,14 @@ import re
 import numpy as np
 import pytest
 
-from jaxslam.config import UNITS, Params, default_params
 from jaxslam.parameter_file import (
-    MEANING,
     Learning,
     load_learning,
     load_params,
     save_params,
     validate,
 )
+from jaxslam.parameters import Params, default_params
 
 BASE = default_params()
 
@@ -33,8 +32,13 @@ def refused(path, base=BASE, load=load_params):
     return str(caught.value)
 
 
-def test_every_parameter_has_unit_and_meaning():
-    assert list(MEANING) == list(UNITS) == list(Params._fields)
+def test_former_names_are_read_and_a_name_given_twice_is_refused(tmp_path):
+    path = write(tmp_path, 'growth = 0.3\n[learn]\nparameters = ["caution", "err_rot"]\n')
+    found = load_learning(path, BASE)
+    assert found.params == BASE._replace(landmark_extent=0.3)
+    assert found.names == ("extra_bearing_noise", "err_rot")
+    path = write(tmp_path, "growth = 0.3\nlandmark_extent = 0.2\n")
+    assert "growth is the former name of landmark_extent; give one of them" in refused(path)
 
 
 def test_what_is_saved_is_read_back_to_the_last_digit(tmp_path):

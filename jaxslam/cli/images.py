@@ -128,9 +128,9 @@ def sensor(
     Example: jaxslam calibrate sensor straight.npz --out params.toml --figure points.png
     """
     from calibration import sensor_report
-    from jaxslam.config import default_params
     from jaxslam.logs.log_file import load_log
     from jaxslam.parameter_file import save_params
+    from jaxslam.parameters import default_params
 
     check_new(out, overwrite, "a file of parameters", ".toml")
     drive = load_log(log)
@@ -177,8 +177,8 @@ def extract(
 
     Example: jaxslam extract images/ --camera c.toml --odometry o.csv --out OUT.npz
     """
-    from jaxslam.config import default_params
     from jaxslam.parameter_file import load_params
+    from jaxslam.parameters import default_params
     from jaxslam.vision.camera_files import load_camera
     from jaxslam.vision.extract import extract as run_extract
 
@@ -207,9 +207,9 @@ def triangulate(
 
     Example: jaxslam triangulate lost-in-the-woods OUT.npz
     """
-    from jaxslam.config import default_params
     from jaxslam.logs.log_file import load_log, save_log
     from jaxslam.parameter_file import load_params
+    from jaxslam.parameters import default_params
     from jaxslam.vision.log_triangulation import triangulate_log
 
     check_new(out, overwrite)

@@ -178,7 +178,7 @@ def _config(parts, sensor, association, particles, landmarks):
     from jaxslam.runs.run import config_for
 
     # Else doubles of landmarks would pay, and noise be learnt too small.
-    told = {"particles": particles, "even": association == "sampled"}
+    told = {"particles": particles, "uniform_association_prior": association == "sampled"}
     told |= {"landmarks": landmarks} if landmarks else {}
     told["descriptors"] = 0  # every part would have its own coordinates
     made = [config_for(part, sensor, association, proposal="informed", **told) for part in parts]
@@ -199,9 +199,9 @@ def _config(parts, sensor, association, particles, landmarks):
 
 def _task(train, config, path, parameters):
     """`paramfile.Learning`: where to start, what to learn, in which bounds, with which priors."""
-    from jaxslam.config import default_params
     from jaxslam.learning import fit, likelihood, transforms
     from jaxslam.parameter_file import Learning, load_learning
+    from jaxslam.parameters import TABLE, default_params
 
     base = default_params(config.sensor, train[0])
     for log in train:
@@ -214,15 +214,17 @@ def _task(train, config, path, parameters):
         names = tuple(name.strip() for name in parameters.split(","))
     if names is None:  # what starts at 0 has no logarithm; who wants it learnt names it
         names = fit.default_names(config)
-        names = tuple(n for n in names if getattr(start, n) > 0 or n in transforms.LINEAR)
+        names = tuple(n for n in names if getattr(start, n) > 0 or TABLE[n].scale == "linear")
     if len(set(names)) < len(names):
         raise ValueError(f"--parameters: {', '.join(names)}; name each once")
     with _without_clip_warning():
         likelihood.check(config, names=names)
-    if "sigma_bearing" in names and start.caution:
-        note(f"caution, {start.caution:g} rad, becomes a part of sigma_bearing: it is learnt")
-        both = (start.sigma_bearing**2 + start.caution**2) ** 0.5
-        start = start._replace(sigma_bearing=both, caution=0.0)
+    if "sigma_bearing" in names and start.extra_bearing_noise:
+        note(
+            f"extra_bearing_noise, {start.extra_bearing_noise:g} rad, becomes a part of sigma_bearing: it is learnt"
+        )
+        both = (start.sigma_bearing**2 + start.extra_bearing_noise**2) ** 0.5
+        start = start._replace(sigma_bearing=both, extra_bearing_noise=0.0)
     transforms.free_vector(start, names)  # refuses a start at 0
     mine = [
         {name: pair for name, pair in pairs.items() if name in names}

@@ -46,8 +46,9 @@ def build_model(
     rejuvenate=None, descriptors=None,
 ):  # fmt: skip
     """`Config` and `Params` as the options say."""
-    from jaxslam.config import Config, default_params
+    from jaxslam.config import Config
     from jaxslam.parameter_file import load_params
+    from jaxslam.parameters import default_params
     from jaxslam.runs.run import config_for
 
     if particles % devices:

@@ -81,7 +81,11 @@ def update_block(particles, before, rows, odometry, measurements, alike, params,
     if informed:
         axes = proposal.motion_axes(pose, predicted, sensor_pose, odometry, params)
         by_u = proposal.pose_jacobian(sensor, sensor_pose, axes, before.mean, anchor, seen.value)
-    count = (landmarks.in_view(seen, params) & (before.count > 0)).sum(0) if config.even else 1
+    count = (
+        (landmarks.in_view(seen, params) & (before.count > 0)).sum(0)
+        if config.uniform_association_prior
+        else 1
+    )
     inlier = jnp.log1p(-params.outlier) - jnp.log(jnp.maximum(count, 1))
     scorer = landmarks.make_scorer(sensor, seen, before, inlier, by_u)
     new = sensors.log_new_density(sensor, tuple(measurements.value.T), params)
@@ -159,11 +163,11 @@ def _fit_known(sensor, sensor_pose, before, rows, measurements, params):
 
 
 def _add_unmatched(config, density, match, new, clutter, count):
-    """Log densities [n] of a frame's matches, with what is new or clutter, and `even`'s orders."""
+    """Log densities [n] of a frame's matches, with what is new or clutter, and `uniform_association_prior`'s orders."""
     density = density + ordered_sum(jnp.where(match == NEW, new[:, None], 0.0))
     if config.clutter:
         density = density + ordered_sum(jnp.where(match == CLUTTER, clutter, 0.0))
-    if config.even:
+    if config.uniform_association_prior:
         density = density - _log_orders(count, (match >= 0).sum(0))
     return density
 

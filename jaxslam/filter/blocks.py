@@ -92,7 +92,9 @@ def observe(state, chance, odometry, measurements, params, config, frozen=False)
     hold = jax.lax.stop_gradient if frozen else lambda value: value
     pose, n = state.pose, state.pose.shape[1]
     measurements = sensors.apply_position_scale(measurements, params)
-    params = params._replace(sigma_bearing=geometry.norm(params.sigma_bearing, params.caution))
+    params = params._replace(
+        sigma_bearing=geometry.norm(params.sigma_bearing, params.extra_bearing_noise)
+    )
     if config.sensor == "bearing" and config.association == "maximum_likelihood":
         params = sensors.cap_new_density(params)
     if not config.clutter:

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.config import default_params
 from jaxslam.logs.appearance_space import fit_appearance_space
 from jaxslam.logs.odometry import Odometry, increments
 from jaxslam.models.sensors import Measurements
+from jaxslam.parameters import default_params
 
 
 class Frames(NamedTuple):
@@ -79,7 +79,7 @@ def _values(log, sensor, params):
     params = default_params(sensor, log) if params is None else params
     r, c, s = log.range, np.cos(log.bearing), np.sin(log.bearing)
     along = params.sigma_range**2
-    across = r**2 * (params.sigma_bearing**2 + (params.growth / r) ** 2)
+    across = r**2 * (params.sigma_bearing**2 + (params.landmark_extent / r) ** 2)
     xy = c * s * (along - across)
     cov = np.column_stack([c**2 * along + s**2 * across, xy, s**2 * along + c**2 * across])
     return np.column_stack([r * c, r * s]), cov, r

@@ -110,7 +110,9 @@ def place_given(world, known):
         raise ValueError(f"{size} landmarks given, but the map has {world.count.shape[0]} slots")
     return world._replace(
         count=world.count.at[:size].set(1),
-        landmark_id=world.landmark_id.at[:size].set(-jnp.arange(4, 4 + size, dtype=jnp.int32)[:, None]),
+        landmark_id=world.landmark_id.at[:size].set(
+            -jnp.arange(4, 4 + size, dtype=jnp.int32)[:, None]
+        ),
         log_odds=None if world.log_odds is None else world.log_odds.at[:size].set(jnp.inf),
         **{
             name: getattr(world, name).at[:, :size].set(jnp.asarray(value)[:, :, None])

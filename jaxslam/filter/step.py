@@ -225,7 +225,9 @@ def conclude(chance, state, seen, measurements, config):
     ess = 1 / jnp.sum(weight**2)
     threshold = config.resample_threshold
     wanted = measurements.active & ((ess < threshold * config.particles) | (threshold >= 1))
-    match, landmark_id = sharding.select_particle((seen.match, seen.landmark_id), estimate.best, config)
+    match, landmark_id = sharding.select_particle(
+        (seen.match, seen.landmark_id), estimate.best, config
+    )
     moved = State(
         pose,
         seen.landmarks,

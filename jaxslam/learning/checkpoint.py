@@ -9,7 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.config import FORMER_FIELDS
 from jaxslam.files import atomic_write
+from jaxslam.parameters import FORMER_NAMES
 
 
 def fingerprint_of(settings, data):
@@ -18,6 +20,8 @@ def fingerprint_of(settings, data):
     The settings' text is the one of version 0.1, whose checkpoints can still be resumed.
     """
     text = repr(settings).replace(type(settings).__name__, "_Told", 1)
+    for former, name in (FORMER_NAMES | FORMER_FIELDS).items():
+        text = text.replace(name, former)
     digest = hashlib.sha256(text.encode())
     for leaf in jax.tree.leaves(data):
         digest.update(np.ascontiguousarray(leaf).tobytes())

@@ -2,7 +2,7 @@
 
 The paper takes a measurement for a 2-D normal point. Alternatives for what is measured as range
 and bearing, or bearing alone: normal; normal sideways noise that is the larger the nearer (what is
-seen has a size: `growth`); either with a share `outlier` of measurements from anywhere in the view
+seen has a size: `landmark_extent`); either with a share `outlier` of measurements from anywhere in the view
 (heavy-tailed). Evidences of one log are comparable only as densities of the same thing: that of a
 point (x, y) is per m^2, that of (range, bearing) per m rad, and r times as large, since
 dx dy = r dr dbearing. The sum of log r over the measurements is added to the former.
@@ -14,10 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.config import UNITS
 from jaxslam.filter.frames import frames_from_log
 from jaxslam.learning import fit
-from jaxslam.learning.likelihood import OF_MOTION
+from jaxslam.parameters import MOTION, TABLE
 
 FRESH = 8  # seeds that judge
 GROWTH = 0.02  # m: where growth starts if it is 0; its logarithm is learnt
@@ -63,22 +62,26 @@ def model_of(model, config, params):
     """`Config`, start `Params` and the sensor's names to learn of a model."""
     heavy, ranged = "heavy_tailed" in model, "range_dependent" in model
     # The noise is all in the model: nothing is added to it.
-    sigma = float(np.hypot(params.sigma_bearing, params.caution))
-    params = params._replace(sigma_bearing=sigma, caution=0.0)
+    sigma = float(np.hypot(params.sigma_bearing, params.extra_bearing_noise))
+    params = params._replace(sigma_bearing=sigma, extra_bearing_noise=0.0)
     config = dataclasses.replace(config, clutter=heavy)
     if model == "point":
         return dataclasses.replace(config, sensor="position"), params, ("position_scale",)
     names = ("sigma_range",) if config.sensor == "range_bearing" else ()
-    names += ("sigma_bearing",) + ("growth",) * ranged + ("outlier",) * heavy
-    growth = (params.growth or GROWTH) if ranged else 0.0
-    return config, params._replace(growth=growth, outlier=params.outlier or OUTLIER), names
+    names += ("sigma_bearing",) + ("landmark_extent",) * ranged + ("outlier",) * heavy
+    landmark_extent = (params.landmark_extent or GROWTH) if ranged else 0.0
+    return (
+        config,
+        params._replace(landmark_extent=landmark_extent, outlier=params.outlier or OUTLIER),
+        names,
+    )
 
 
 def _judged(model, train, held_out, config, params, names, seeds, steps, seed):
     config, start, own = model_of(model, config, params)
     if model == "point":
         train, held_out = ([_without_points(log) for log in logs] for logs in (train, held_out))
-    names = (*(name for name in names if name in OF_MOTION), *own)
+    names = (*(name for name in names if MOTION in TABLE[name].learned_by), *own)
     found = fit.fit(train, config, start, names, held_out, seeds=seeds, steps=steps, seed=seed)
     # Positions are made with the noise they were learnt with, whose scale is then the fit's.
     evidence = fit.evidence(held_out, config, found.params, FRESH, seed + 7919)
@@ -109,7 +112,7 @@ def table(rows):
     for row in rows:
         told = f"{np.mean(row.evidence):.2f} ± {np.std(row.evidence, ddof=1):.2f}"
         behind = f"{_mean(row) - _mean(rows[0]):.2f}"
-        values = (f"{name} {value:.3g} {UNITS[name]}" for name, value in row.values.items())
+        values = (f"{name} {value:.3g} {TABLE[name].unit}" for name, value in row.values.items())
         lines.append(f"{row.model:30}{told:>24}{behind:>16}  {', '.join(values)}")
     return "\n".join(lines)
 

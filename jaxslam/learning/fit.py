@@ -20,12 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxslam.config import Params
 from jaxslam.filter import sharding
 from jaxslam.learning import likelihood
 from jaxslam.learning.checkpoint import fingerprint_of, load_state, save_state
-from jaxslam.learning.transforms import SCALE, free_vector, from_free, to_free, to_params, with_free
+from jaxslam.learning.transforms import free_vector, from_free, to_free, to_params, with_free
 from jaxslam.parameter_file import validate
+from jaxslam.parameters import TABLE, Params
 
 TAIL = 0.3  # share of the steps whose mean is the estimate
 LAST_RATE = 0.05  # of the first
@@ -160,7 +160,7 @@ def fit(
     Logs are independent runs, or windows of one; `batch` of them (None: all) and `seeds` seeds of
     each make a step. `bounds`: (low, high) by name, in its own unit. `priors`: (value, standard
     deviation) by name, normal on the free scale: the deviation is of the logarithm, the log-odds
-    (`outlier`) or the value itself (`scale.LINEAR`). Every `every` steps the last iterates' mean is
+    (`outlier`) or the value itself (those of linear scale in `PARAMETERS`). Every `every` steps the last iterates' mean is
     judged on the `held_out` logs with fresh seeds; `patience` times without improvement end the
     fit, and the last estimate that was not clearly worse than the best is taken. `checkpoint`:
     file (.npz) written then; `resume`: go on from it, to the same result. `progress`: called with
@@ -297,7 +297,7 @@ class _Trainer:
         gradient = np.zeros(len(free))
         for name, (centre, spread) in told.priors.items():
             i = told.names.index(name)
-            spread = spread / SCALE.get(name, 1.0)
+            spread = spread / TABLE[name].step
             gradient[i] = share * (float(to_free(name, centre)) - free[i]) / spread**2
         return gradient
 

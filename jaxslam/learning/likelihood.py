@@ -22,7 +22,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.config import Params
 from jaxslam.filter import blocks, resampling
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.association import CLUTTER, NEW
@@ -30,6 +29,7 @@ from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.odometry import Odometry
 from jaxslam.models import motion
 from jaxslam.models.sensors import Measurements
+from jaxslam.parameters import ALTERNATIVES, MOTION, Params, learned_by
 
 ESTIMATORS = ("fisher", "pathwise", "plain")
 DISCOUNT = 0.97
@@ -37,15 +37,6 @@ BIASED = (
     "association 'maximum_likelihood' biases the score: noise comes out too small where landmarks "
     "are close; learn with 'sampled'"
 )
-OF_MOTION = ("err_tran", "err_rot", "err_drift", "floor_tran", "floor_rot")
-OF_MOTION += ("gain_tran", "gain_rot", "bias_drift")
-OF_ALTERNATIVES = ("outlier", "density_new")
-_MOUNTING = ("mount_x", "mount_y", "mount_yaw")
-OF_SENSOR = {
-    "position": ("position_scale", *_MOUNTING),
-    "range_bearing": ("sigma_range", "sigma_bearing", "growth", *_MOUNTING),
-    "bearing": ("sigma_bearing", "growth", *_MOUNTING, "inv_depth_mean", "inv_depth_sd"),
-}
 
 
 class Data(NamedTuple):
@@ -76,7 +67,7 @@ class Score(NamedTuple):
 
 def learnable(config):
     """Names of the parameters that have a derivative under this configuration."""
-    names = (*OF_MOTION, *OF_ALTERNATIVES, *OF_SENSOR[config.sensor])
+    names = (*learned_by(MOTION), *learned_by(ALTERNATIVES), *learned_by(config.sensor))
     return tuple(name for name in names if config.clutter or name != "outlier")
 
 
@@ -266,7 +257,7 @@ def _filter_through(names, config, measurements, frozen):
     """Those of the names whose derivatives go through poses or landmarks."""
     if not frozen:
         return names
-    sensor = OF_SENSOR[config.sensor]
+    sensor = learned_by(config.sensor)
     if measurements.scale is not None:
         sensor = (*sensor, "gain_tran")
     return tuple(name for name in names if name in sensor)
@@ -290,7 +281,9 @@ def _step(carry, frame, params, key, config, names, through, estimator, discount
     )
     gained = dict(zip(through, by_density, strict=True))
     if frozen:
-        drawn = motion_score(seen.u, odometry, params, [n for n in names if n in OF_MOTION])
+        drawn = motion_score(
+            seen.u, odometry, params, [n for n in names if n in learned_by(MOTION)]
+        )
         told = alternatives_score(seen.match, params)
         for name, more in {**drawn, **{n: told[n] for n in names if n in told}}.items():
             gained[name] = gained[name] + more if name in gained else more

@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from jaxslam.config import UNITS
 from jaxslam.files import atomic_write
 from jaxslam.learning.likelihood import BIASED, DISCOUNT
-from jaxslam.learning.transforms import TRANSFORM, from_free
+from jaxslam.learning.transforms import from_free
 from jaxslam.learning.uncertainty import MANY
+from jaxslam.parameters import TABLE
 from jaxslam.plotting import FILTER, LANDMARK, RECKONING, REFINED, STYLE, write_figure
 
 KNOWN = 2.0  # free scale: from here on (a factor of 7) a standard error is without meaning
@@ -41,7 +41,7 @@ def table(fit, errors):
         told = [f"{getattr(params, name):.4g}" for params in (fit.start, fit.params)]
         numbers = (errors.standard_error[i], errors.monte_carlo_error[i])
         told += [f"{number:.2g}" if name in known else "-" for number in numbers]
-        rows.append((name, *told, UNITS[name], errors.verdict[i]))
+        rows.append((name, *told, TABLE[name].unit, errors.verdict[i]))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     align = "<>>>><<"
     return "\n".join(
@@ -193,14 +193,14 @@ def _draw_parameter(axes, fit, errors, i, name):
     span = np.ptp(shown)
     near = [max(low, shown.min() - span), min(high, shown.max() + span)]
     fit_axis(axes, "y", name, min(shown.min(), near[0]), max(shown.max(), near[1]))
-    axes.set_title(f"{name} [{UNITS[name]}]")
+    axes.set_title(f"{name} [{TABLE[name].unit}]")
 
 
 def fit_axis(axes, side, name, low, high):
     """Limits of an axis for a parameter between two values; logarithmic where they are far apart
     and the parameter is learnt as a logarithm."""
     axis = getattr(axes, f"{side}axis")
-    if TRANSFORM[name] == "log" and low > 0 and high / low > WIDE:
+    if TABLE[name].scale == "log" and low > 0 and high / low > WIDE:
         getattr(axes, f"set_{side}scale")("log")
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.set_major_formatter(ScalarFormatter())
@@ -209,7 +209,7 @@ def fit_axis(axes, side, name, low, high):
         limits = low / margin, high * margin
     else:
         margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
-        least = -np.inf if TRANSFORM[name] == "linear" else 0.0
+        least = -np.inf if TABLE[name].scale == "linear" else 0.0
         limits = max(low - margin, least), high + margin
     getattr(axes, f"set_{side}lim")(*limits)
 

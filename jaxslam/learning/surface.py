@@ -10,11 +10,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from jaxslam.config import UNITS, Params
 from jaxslam.filter import sharding
 from jaxslam.learning import fit as learn
 from jaxslam.learning import likelihood, transforms
 from jaxslam.learning.report import KNOWN, estimates, fit_axis
+from jaxslam.parameters import TABLE, Params
 from jaxslam.plotting import LANDMARK, RECKONING, STYLE, ellipses
 
 CELLS = 9
@@ -103,7 +103,7 @@ def draw_surface(found, fit, errors):
         _draw_path(axes, found, fit, errors, where)
         for side, name, values in (("x", found.names[0], x), ("y", found.names[1], y)):
             fit_axis(axes, side, name, values.min(), values.max())
-            getattr(axes, f"set_{side}label")(f"{name} [{UNITS[name]}]")
+            getattr(axes, f"set_{side}label")(f"{name} [{TABLE[name].unit}]")
             getattr(axes, f"set_{side}lim")(values.min(), values.max())
         axes.grid(False)
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)

@@ -8,30 +8,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.config import Params
-
-LINEAR = ("bias_drift", "mount_x", "mount_y", "mount_yaw")
-# Steps of a unit are what Adam takes at first: of a gain, no log leaves a factor e open.
-SCALE = {name: 0.1 for name in (*LINEAR, "gain_tran", "gain_rot")}
-TRANSFORM = {name: "linear" if name in LINEAR else "log" for name in Params._fields}
-TRANSFORM["outlier"] = "logit"
+from jaxslam.parameters import TABLE
 
 
 def to_free(name, value):
     """A parameter's value on the free scale."""
-    kind = TRANSFORM[name]
-    if kind == "logit":
+    row = TABLE[name]
+    if row.scale == "logit":
         return jnp.log(value) - jnp.log1p(-value)
-    return (jnp.log(value) if kind == "log" else value) / SCALE.get(name, 1.0)
+    return (jnp.log(value) if row.scale == "log" else value) / row.step
 
 
 def from_free(name, free):
     """A parameter's value from the free scale."""
-    kind = TRANSFORM[name]
-    if kind == "logit":
+    row = TABLE[name]
+    if row.scale == "logit":
         return jax.nn.sigmoid(free)
-    free = free * SCALE.get(name, 1.0)
-    return jnp.exp(free) if kind == "log" else free
+    free = free * row.step
+    return jnp.exp(free) if row.scale == "log" else free
 
 
 def with_free(params, names, free):
@@ -53,7 +47,7 @@ def free_vector(params, names):
     """
     for name in names:
         value = float(getattr(params, name))
-        if TRANSFORM[name] != "linear" and value <= 0:
+        if TABLE[name].scale != "linear" and value <= 0:
             raise ValueError(f"{name} is {value:g}: to be learnt it must start above 0")
     with jax.enable_x64(True):
         return np.array([float(to_free(n, float(getattr(params, n)))) for n in names])

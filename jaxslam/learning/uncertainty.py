@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.config import Params
 from jaxslam.learning import fit as learn
 from jaxslam.learning import likelihood
 from jaxslam.learning.transforms import derivative_at, to_params
+from jaxslam.parameters import Params
 
 OPEN = 1.0  # free scale: a standard deviation from which on a direction is unresolved
 FAINT = 3.0  # free scale: nobody knows less of a parameter than this standard deviation
@@ -32,7 +32,7 @@ WHY = {
     frozenset({"gain_rot"}): "the log turns too little",
     frozenset({"gain_tran"}): "nothing but odometry sets the scale",
     frozenset({"gain_rot", "bias_drift"}): "the log turns along with driving",
-    frozenset({"sigma_bearing", "growth"}): "landmarks are all at about one distance",
+    frozenset({"sigma_bearing", "landmark_extent"}): "landmarks are all at about one distance",
     frozenset({"mount_yaw", "gain_rot"}): "the log turns along with driving",
 }
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from jaxslam.config import Params
 from jaxslam.logs.validation import assign, check_array, check_number, check_rows, check_stamps
+from jaxslam.parameters import FORMER_NAMES, Params
 
 # Rows by design not for the filter (another robot seen) are counted under reasons that start so.
 NOT_USED = "not used: "
@@ -247,7 +247,7 @@ def _check_sensor(log):
     assign(log, "mounting", tuple(check_array("mounting", log.mounting, np.float64, (3,)).tolist()))
     assign(log, "time_offset", check_number("time_offset", log.time_offset))
     for name in log.noise:
-        if name not in Params._fields:
+        if name not in Params._fields and name not in FORMER_NAMES:
             allowed = ", ".join(Params._fields)
             raise ValueError(f"noise/{name}: no such parameter; allowed: {allowed}")
     assign(log, "noise", {k: check_number(f"noise/{k}", v) for k, v in log.noise.items()})

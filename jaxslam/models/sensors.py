@@ -86,7 +86,7 @@ def correlated_noise(params, odometry):
     half = travel / (2 * jnp.where(on, params.correlation, 1.0))
     inflation = 1 / jnp.tanh(jnp.clip(half, 1 / MOST_INFLATION, 10.0))
     root = jnp.where(on, jnp.sqrt(inflation), 1.0)
-    names = ("sigma_bearing", "growth", "sigma_range", "position_scale")
+    names = ("sigma_bearing", "landmark_extent", "sigma_range", "position_scale")
     return params._replace(**{name: getattr(params, name) * root for name in names})
 
 
@@ -96,8 +96,8 @@ def sensor_pose_of(pose, params):
 
 
 def bearing_variance(r, params):
-    """Variance of a bearing [rad^2] at range `r`: what is seen has a size (`growth`, m)."""
-    return params.sigma_bearing**2 + (params.growth / r) ** 2
+    """Variance of a bearing [rad^2] at range `r`: what is seen has a size (`landmark_extent`, m)."""
+    return params.sigma_bearing**2 + (params.landmark_extent / r) ** 2
 
 
 def ray(sensor_pose, mean, anchor):
@@ -117,7 +117,7 @@ def along_ray(point, by_direction, by_depth, depth, heading, params):
     row = ((dx * ty - dy * tx) * scale, (dx * ay - dy * ax) * scale)
     stretch = ((dx * tx + dy * ty) * scale, (dx * ax + dy * ay) * scale)
     r = q / jnp.maximum(depth, LEAST_INVERSE_DEPTH)
-    variance = params.sigma_bearing**2 + (params.growth * depth / q) ** 2
+    variance = params.sigma_bearing**2 + (params.landmark_extent * depth / q) ** 2
     return Prediction((bearing,), (row,), (variance,), r, bearing, stretch)
 
 
@@ -144,7 +144,7 @@ def locate(sensor, sensor_pose, value, cov, params):
     sx, sy, heading = sensor_pose
     anchor = (sx, sy)
     if sensor == "bearing":
-        variance = params.sigma_bearing**2 + (params.growth * params.inv_depth_mean) ** 2
+        variance = params.sigma_bearing**2 + (params.landmark_extent * params.inv_depth_mean) ** 2
         mean = (heading + value[0], params.inv_depth_mean + jnp.zeros_like(sx))
         zero = jnp.zeros_like(sx)
         return mean, (jnp.sqrt(variance) + zero, zero, params.inv_depth_sd + zero), anchor

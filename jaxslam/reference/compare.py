@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.config import Params, default_params
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.truth import truth_at, wrap
 from jaxslam.models import geometry
+from jaxslam.parameters import Params, default_params
 from jaxslam.reference import ekf
 from jaxslam.reference import fastslam as baseline
 from jaxslam.results.metrics import ate
@@ -278,7 +278,9 @@ def _map_difference(world, particles):
     cov = np.stack(geometry.covariance(world.factor.astype(float)))
     largest = 0.0
     for i, particle in enumerate(particles):
-        marks = sorted((m for m in particle.landmarks if m is not None), key=lambda m: m.landmark_id)
+        marks = sorted(
+            (m for m in particle.landmarks if m is not None), key=lambda m: m.landmark_id
+        )
         slots = np.flatnonzero(world.count[:, i])
         slots = slots[np.argsort(world.landmark_id[slots, i])]
         births = [(m.landmark_id, m.count) for m in marks]

@@ -87,7 +87,7 @@ def noise(r, measurement, model):
     """
     if model.sensor == "position":
         return model.position_scale**2 * measurement.cov
-    var_bearing = model.sigma_bearing**2 + (model.growth / max(abs(r), MIN_RANGE)) ** 2
+    var_bearing = model.sigma_bearing**2 + (model.landmark_extent / max(abs(r), MIN_RANGE)) ** 2
     if model.sensor == "bearing":
         return np.array([[var_bearing]])
     return np.diag([model.sigma_range**2, var_bearing])
@@ -168,7 +168,7 @@ def create(measurement, s, landmark_id, model):
     """A landmark seen for the first time, from sensor pose s [3]."""
     if model.sensor == "bearing":
         mean = np.array([s[2] + measurement.value[0], model.inv_depth_mean])
-        var_phi = model.sigma_bearing**2 + (model.growth * model.inv_depth_mean) ** 2
+        var_phi = model.sigma_bearing**2 + (model.landmark_extent * model.inv_depth_mean) ** 2
         cov = np.diag([var_phi, model.inv_depth_sd**2])
     else:
         r, point, jacobian = None, measurement.value, rotation(s[2])

@@ -62,11 +62,11 @@ def numbers(record):
 def make_model(params, config):
     """Params' numbers and Config's choices as one record; without clutter nothing is an outlier.
 
-    Bearings are as noisy as they are with `caution` rad of further, independent error.
+    Bearings are as noisy as they are with `extra_bearing_noise` rad of further, independent error.
     """
     values = {name: float(value) for name, value in numbers(params).items()}
     model = SimpleNamespace(**values | vars(config))
-    model.sigma_bearing = math.sqrt(model.sigma_bearing**2 + model.caution**2)
+    model.sigma_bearing = math.sqrt(model.sigma_bearing**2 + model.extra_bearing_noise**2)
     if not model.clutter:
         model.outlier = 0.0
     return model
@@ -209,7 +209,7 @@ def with_extra_noise(model, o):
         -min(max((o.distance + o.turn / 10) / model.correlation, 2 / MOST_DULLED), 20.0)
     )
     ratio = (1 + alike) / (1 - alike)
-    noisy = ("sigma_range", "sigma_bearing", "growth", "position_scale")
+    noisy = ("sigma_range", "sigma_bearing", "landmark_extent", "position_scale")
     louder = {name: getattr(model, name) * math.sqrt(ratio) for name in noisy}
     return SimpleNamespace(**vars(model) | louder)
 

@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.config import Config, default_params
+from jaxslam.config import Config
 from jaxslam.logs.truth import truth_at
+from jaxslam.parameters import default_params
 from jaxslam.reference.compare import select_frames, thin
 from jaxslam.results.metrics import align_se2, alignable, ate, has_truth, map_error
 from jaxslam.runs import run

@@ -8,8 +8,9 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from jaxslam.config import Config, Params
+from jaxslam.config import Config
 from jaxslam.logs.log_file import BUNDLED, load_log
+from jaxslam.parameters import Params, current_names
 from jaxslam.results.figures import draw_figures
 from jaxslam.results.metrics import compute_errors
 from jaxslam.results.result import MapEstimate, Result
@@ -25,7 +26,7 @@ def load_result(directory, log=None):
     directory = Path(directory)
     try:
         told = tomllib.loads((directory / "run.toml").read_text(encoding="utf-8"))
-        config, params = Config(**told["config"]), Params(**told["params"])
+        config, params = Config.from_dict(told["config"]), Params(**current_names(told["params"]))
         summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
         with (
             open(directory / "steps.npz", "rb") as file,

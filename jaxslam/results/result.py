@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jaxslam.config import Config, Params
+from jaxslam.config import Config
 from jaxslam.logs.log import NOT_USED, Log
+from jaxslam.parameters import Params
 from jaxslam.smoother.events import FAILED
 from jaxslam.smoother.genealogy import Ancestral, Lineage
 

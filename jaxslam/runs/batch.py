@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.config import Params
 from jaxslam.files import fsync_all, move_folder, temporary_sibling
 from jaxslam.filter.sharding import map_over_devices
 from jaxslam.parameter_file import validate
+from jaxslam.parameters import Params
 from jaxslam.results import run_folder
 from jaxslam.results.events import association_entropy
 from jaxslam.runs import compiled, memory

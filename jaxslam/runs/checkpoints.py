@@ -22,10 +22,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.config import default_params
+from jaxslam.config import FORMER_FIELDS
 from jaxslam.filter import sharding
 from jaxslam.logs.odometry import Odometry
 from jaxslam.models.sensors import Measurements
+from jaxslam.parameters import current_names, default_params
 from jaxslam.results import run_folder, run_lock
 from jaxslam.runs import checkpoint_file, compiled
 from jaxslam.runs import memory as capacity
@@ -124,7 +125,7 @@ class Checkpoints:
         for path in self._files() if self.resume else ():
             try:
                 with checkpoint_file.open_checkpoint(path) as (about, _):
-                    before, versions = about["run"], about["versions"]
+                    before, versions = _current(about["run"]), about["versions"]
             except ValueError as error:
                 self.say(f"warning: a broken checkpoint is left aside: {error}")
                 continue
@@ -300,7 +301,7 @@ def check_finished(folder, log, config, params, seed):
     if not same:
         raise ValueError(f"{folder}: is finished, but of another log, or part of it")
     before = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8"))
-    if differing := find_differences(before, _settings(config, params, seed)):
+    if differing := find_differences(_current(before), _settings(config, params, seed)):
         raise ValueError(f"{folder}: is finished, but of another run; differing: {differing}")
 
 
@@ -320,6 +321,24 @@ def _settings(config, params, seed):
         "config": {k: v for k, v in vars(config).items() if k not in NO_MATTER},
         "params": {k: float(v) for k, v in params._asdict().items()},
     }
+
+
+def _current(told):
+    """Settings as a file holds them, with names of version 0.1 replaced."""
+    config = {FORMER_FIELDS.get(name, name): value for name, value in told["config"].items()}
+    return told | {"config": config, "params": current_names(told["params"])}
+
+
+def _current_entries(get, stored):
+    """`get`, a function of an entry's name, that also finds entries by their names of version 0.1;
+    `stored`: the names that are there."""
+
+    def get_by_either(name):
+        former = name.replace("summary.landmark_id", "summary.match")
+        former = former.replace("landmark_id", "birth")
+        return get(name if name in stored else former)
+
+    return get_by_either
 
 
 def _path(place, done):
@@ -356,6 +375,7 @@ def _columns(at):
 def _read(path, shapes):
     """`Filtered` of a checkpoint. Raises `ValueError` if anything in it is not sound."""
     with checkpoint_file.open_checkpoint(path) as (about, get):
+        get = _current_entries(get, about["arrays"])
         summary = Summary(*(get(f"summary.{name}") for name in Summary._fields))
         tree = _tree(get) if about["genealogy"] and sharding.is_leader() else None
         past = (

@@ -8,13 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.config import Config, default_params
+from jaxslam.config import Config
 from jaxslam.filter import sharding
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.appearance_space import fit_appearance_space
 from jaxslam.parameter_file import validate
+from jaxslam.parameters import default_params
 from jaxslam.results.events import association_entropy
+from jaxslam.runs import compiled
 from jaxslam.runs import memory as capacity
 from jaxslam.runs.assemble import (
     RunProgress,
@@ -24,7 +26,6 @@ from jaxslam.runs.assemble import (
     settle_donated,
 )
 from jaxslam.runs.compiled import (
-    TREE_BYTES,
     compile_loop,
     estimate_memory,
     split_into_chunks,
@@ -148,7 +149,10 @@ def _filter(steps, key, at, data, params, config, renewal, progress, checkpoints
             state = _run_chunk(steps, (key, at.state, jnp.int32(count), *chunk, params), at, count)
             spent = time.perf_counter() - begin
             tree = at.tree
-            if tree is not None and tree.nodes * 4 * (config.measurements + 4) > TREE_BYTES:
+            if (
+                tree is not None
+                and tree.nodes * 4 * (config.measurements + 4) > compiled.TREE_BYTES
+            ):
                 tree = None
             at = at._replace(state=state, tree=tree, done=at.done + count, seconds=spent)
             speed = (at.done - start) / (time.perf_counter() - session)

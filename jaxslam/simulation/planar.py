@@ -20,7 +20,15 @@ GRID_SPACING = 2.0  # m between the nodes of a grid
 FIELD_AREA = 4.0  # m^2 of an open field per landmark
 
 # what is handed on to the filter, under the names of `Params`
-NOISE = ("err_tran", "err_rot", "err_drift", "floor_tran", "floor_rot", "growth", "bias_drift")
+NOISE = (
+    "err_tran",
+    "err_rot",
+    "err_drift",
+    "floor_tran",
+    "floor_rot",
+    "landmark_extent",
+    "bias_drift",
+)
 NOISE += ("gain_tran", "gain_rot", "sigma_range", "sigma_bearing", "detection", "outlier")
 
 
@@ -47,7 +55,7 @@ def planar(
     bias_drift: float = 0.0,  # rad/m, systematic
     sigma_range: float = 0.05,  # m, standard deviation
     sigma_bearing: float = 0.02,  # rad, standard deviation at a distance
-    growth: float = 0.0,  # m: bearing variance = sigma_bearing^2 + (growth / true range)^2
+    landmark_extent: float = 0.0,  # m: bearing variance = sigma_bearing^2 + (landmark_extent / true range)^2
     detection: float = 0.9,  # probability of being seen at range 0, linearly to 0 at view[2]
     outlier: float = 0.02,  # probability of a measurement to be clutter
     max_per_frame: int | None = 16,  # of more measurements so many are kept, at random; None: all
@@ -83,7 +91,7 @@ def _draw(given):
     ranges, bearings, identity = (np.concatenate(column) for column in zip(*looks, strict=True))
     noise = {name: getattr(given, name) for name in NOISE}
     # Drawn from the model itself: nothing to be cautious of.
-    noise |= {"density_new": given.landmarks / area, "caution": 0.0}
+    noise |= {"density_new": given.landmarks / area, "extra_bearing_noise": 0.0}
     return Log(
         name=f"planar-{given.world}-{given.seed}",
         odometry_time=odometry_time,
@@ -272,7 +280,9 @@ def _look(rng, pose, marks, given):
     found = inside & (rng.random(len(r)) < given.detection * np.maximum(0, 1 - r / reach))
     identity = np.flatnonzero(found)
     r, b = r[identity], b[identity]
-    b = _wrap(b + np.hypot(given.sigma_bearing, given.growth / r) * rng.standard_normal(len(b)))
+    b = _wrap(
+        b + np.hypot(given.sigma_bearing, given.landmark_extent / r) * rng.standard_normal(len(b))
+    )
     r = r + given.sigma_range * rng.standard_normal(len(r))
     r, b, identity = r[r > 0], b[r > 0], identity[r > 0]  # no sensor reports a negative range
     # clutter met before the last true one, each measurement being clutter with that probability
@@ -309,7 +319,7 @@ def _check(given):
     }
     for name in ("length_m", "speed", "rate_hz", "odometry_hz", "stop_m", "gain_tran", "gain_rot"):
         rules[name] = 0 < getattr(given, name) < inf, "above 0"
-    for name in ("sigma_range", "sigma_bearing", "growth", "truth_resolution", *NOISE[:5]):
+    for name in ("sigma_range", "sigma_bearing", "landmark_extent", "truth_resolution", *NOISE[:5]):
         rules[name] = 0 <= getattr(given, name) < inf, "0 or more"
     for name, (good, allowed) in rules.items():
         if not good:

@@ -16,9 +16,9 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.special import expit
 
-from jaxslam.config import Params
 from jaxslam.logs.odometry import Odometry
 from jaxslam.models import sensors
+from jaxslam.parameters import Params
 from jaxslam.smoother import normal_equations, residuals
 
 LEAST_INFORMATION = 1e-6  # 1/m^2 of a point that no measurement holds

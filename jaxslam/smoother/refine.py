@@ -60,7 +60,9 @@ class Solved(NamedTuple):
     converged: bool
 
 
-def refine(frames, pose, landmark_id, start_pose, start_cov, params, sensor, known=False, progress=None):
+def refine(
+    frames, pose, landmark_id, start_pose, start_cov, params, sensor, known=False, progress=None
+):
     """`Refined` of one lineage: `pose` [T, 3] and `landmark_id` [T, K] (as `filter.Info.landmark_id`).
 
     `frames`: `frames.Frames` of T frames. `known`: identities say which landmark was measured, and

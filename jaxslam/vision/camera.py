@@ -231,12 +231,12 @@ def _distort(x, y, k):
     """Distorted (x, y) and the Jacobian's entries (xx, xy, yy); k: two radial, two tangential."""
     k1, k2, p1, p2 = k[0], k[1], k[2], k[3]
     square = x * x + y * y
-    radial, growth = 1 + square * (k1 + k2 * square), 2 * (k1 + 2 * k2 * square)
+    radial, landmark_extent = 1 + square * (k1 + k2 * square), 2 * (k1 + 2 * k2 * square)
     out_x = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x)
     out_y = y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y
-    xx = radial + x * x * growth + 2 * p1 * y + 6 * p2 * x
-    xy = x * y * growth + 2 * p1 * x + 2 * p2 * y
-    yy = radial + y * y * growth + 6 * p1 * y + 2 * p2 * x
+    xx = radial + x * x * landmark_extent + 2 * p1 * y + 6 * p2 * x
+    xy = x * y * landmark_extent + 2 * p1 * x + 2 * p2 * y
+    yy = radial + y * y * landmark_extent + 6 * p1 * y + 2 * p2 * x
     return out_x, out_y, (xx, xy, yy)
 
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from jaxslam.config import default_params
 from jaxslam.logs.log import NOT_USED
 from jaxslam.logs.odometry import increments, moments
+from jaxslam.parameters import default_params
 from jaxslam.vision.matching import Appearance, MatchSettings, match_bearings
 from jaxslam.vision.triangulation import (
     OK,

@@ -10,11 +10,11 @@ import pytest
 
 from calibration.odometry import motion_residuals
 from calibration.sensor import fit, turn_frame
-from jaxslam.config import Params, default_params
 from jaxslam.logs.log import Truth
 from jaxslam.logs.log_file import load_log
 from jaxslam.models import motion
 from jaxslam.parameter_file import load_params, save_params
+from jaxslam.parameters import Params, default_params
 from jaxslam.simulation.planar import planar
 
 MOUNTING = (0.2, -0.1, 0.3)
@@ -27,7 +27,7 @@ NOISE = dict(
     bias_drift=0.02,
     sigma_range=0.04,
     sigma_bearing=0.015,
-    growth=0.03,
+    landmark_extent=0.03,
     outlier=0.03,
 )
 
@@ -68,8 +68,10 @@ def test_a_yaw_that_the_log_does_not_know_is_found():
 
 
 def test_no_growth_is_found_where_there_is_none():
-    found = model(growth=0.0)
-    assert 0 <= found.values["growth"] <= 4 * found.standard_errors["growth"] < 0.02
+    found = model(landmark_extent=0.0)
+    assert (
+        0 <= found.values["landmark_extent"] <= 4 * found.standard_errors["landmark_extent"] < 0.02
+    )
     assert found.values["sigma_bearing"] == pytest.approx(0.015, rel=0.1)
 
 
@@ -83,7 +85,7 @@ def test_gross_errors_are_counted_and_do_not_spoil_the_rest():
     extra = found.counts["outliers"] - clean.counts["outliers"]
     assert 0.98 * len(spoilt) <= extra <= len(spoilt)
     assert sum(b.outliers for b in found.by_range) == found.counts["outliers"]
-    for name in ("sigma_range", "sigma_bearing", "growth", "mount_yaw"):
+    for name in ("sigma_range", "sigma_bearing", "landmark_extent", "mount_yaw"):
         near = 2 * clean.standard_errors[name]
         assert found.values[name] == pytest.approx(clean.values[name], abs=near), name
 
@@ -108,14 +110,14 @@ def test_measured_identities_serve_where_true_ones_are_missing():
     # What has no measured identity may be anything: it is not called clutter.
     assert found.counts["measurements"] == (log.identity >= 0).sum()
     assert found.values["outlier"] < 1e-3
-    assert found.values["growth"] == model().values["growth"]
+    assert found.values["landmark_extent"] == model().values["landmark_extent"]
 
 
 def test_bearings_alone_are_enough():
     found = fit(replace(drive(), range=None))
     assert "sigma_range" not in found.values
     assert np.isnan([b.range_sd for b in found.by_range]).all()
-    for name in ("sigma_bearing", "growth", "mount_yaw", "err_drift"):
+    for name in ("sigma_bearing", "landmark_extent", "mount_yaw", "err_drift"):
         near = 0.3 * found.standard_errors[name]  # outliers in range are no longer left out
         assert found.values[name] == pytest.approx(model().values[name], abs=near), name
 
@@ -125,7 +127,7 @@ def test_turning_the_robots_frame_changes_only_where_it_drives():
     found, straight = fit(turned), model()
     assert found.drive_yaw[0] == pytest.approx(straight.drive_yaw[0] - 0.1, abs=1e-4)
     assert found.values["mount_yaw"] == pytest.approx(straight.values["mount_yaw"] - 0.1, abs=1e-6)
-    for name in ("sigma_range", "sigma_bearing", "growth", "err_drift", "gain_rot"):
+    for name in ("sigma_range", "sigma_bearing", "landmark_extent", "err_drift", "gain_rot"):
         assert found.values[name] == pytest.approx(straight.values[name], rel=1e-3), name
     back = turn_frame(turned, -0.1)
     np.testing.assert_allclose(back.mounting, drive().mounting, atol=1e-12)
@@ -173,7 +175,7 @@ def test_bundled_log_has_the_errors_others_found():
     assert 59_900 <= found.counts["measurements"] <= 60_100
     assert v["sigma_range"] == pytest.approx(0.033, abs=0.0015)
     # 0.04 m sideways is a tube's radius; far away hardly anything is left.
-    assert v["growth"] == pytest.approx(0.04, abs=0.005)
+    assert v["landmark_extent"] == pytest.approx(0.04, abs=0.005)
     assert v["sigma_bearing"] < 0.005
     assert np.degrees(bins[0].bearing_sd) == pytest.approx(2.8, abs=0.3)
     assert np.degrees(bins[-1].bearing_sd) == pytest.approx(0.4, abs=0.1)

@@ -15,9 +15,9 @@ from test_images import png
 from test_log_triangulation import normal, straight
 
 from jaxslam.cli import main as cli
-from jaxslam.config import default_params
 from jaxslam.logs.log_file import load_log, save_log
 from jaxslam.parameter_file import load_params
+from jaxslam.parameters import default_params
 from jaxslam.vision import extract as extraction
 from jaxslam.vision.camera_files import load_camera, save_camera
 

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from jaxslam.cli import learn as cli_learn
-from jaxslam.config import Config, default_params
+from jaxslam.config import Config
 from jaxslam.learning import error_models, uncertainty
 from jaxslam.learning import fit as learn
 from jaxslam.logs.log_file import save_log
 from jaxslam.parameter_file import load_learning, load_params
+from jaxslam.parameters import default_params
 from jaxslam.simulation import planar
 
 jax.devices()  # begun here, so that the command does not ask for more devices for all other tests
@@ -199,11 +200,14 @@ def test_caution_becomes_a_part_of_what_is_learnt():
     log = planar.planar(length_m=1.0, landmarks=3)
     log = dataclasses.replace(log, noise={})
     task = cli_learn._task([log], given, None, "sigma_bearing")
-    assert task.params.caution == 0
+    assert task.params.extra_bearing_noise == 0
     assert task.params.sigma_bearing == pytest.approx(
-        np.hypot(params.sigma_bearing, params.caution)
+        np.hypot(params.sigma_bearing, params.extra_bearing_noise)
     )
-    assert cli_learn._task([log], given, None, "err_rot").params.caution == params.caution
+    assert (
+        cli_learn._task([log], given, None, "err_rot").params.extra_bearing_noise
+        == params.extra_bearing_noise
+    )
 
 
 @pytest.mark.parametrize(
@@ -229,7 +233,10 @@ def test_caution_becomes_a_part_of_what_is_learnt():
         (("a.npz", "--out", "new/fit.csv"), "fit.csv: a file of parameters is a .toml file"),
         (("a.npz", "--resume"), "learn.checkpoint.npz: is not there; begin without --resume"),
         (("a.npz", "--parameters", "err_rot,outlier"), "outlier is 0: to be learnt it must start"),
-        (("a.npz", "--sensor", "position", "--parameters", "growth"), "'growth' can't be learnt"),
+        (
+            ("a.npz", "--sensor", "position", "--parameters", "landmark_extent"),
+            "'landmark_extent' can't be learnt",
+        ),
         (("a.npz", "--params", "none.toml"), "none.toml: no such file"),
         (("a.npz", "--seeds", "1"), "--seeds"),
     ],

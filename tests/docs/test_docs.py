@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from jaxslam.config import ASSOCIATIONS, PROPOSALS, SENSORS, UNITS, Config, Params, default_params
+from jaxslam.config import ASSOCIATIONS, PROPOSALS, SENSORS, Config
+from jaxslam.parameters import TABLE, Params, default_params
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = ("equations", "algorithm", "images", "smoothing", "gradients")
@@ -107,7 +108,9 @@ def test_the_defaults_are_the_tables():
     head, *body = [[cell.strip(" `") for cell in line.strip("|").split("|")] for line in lines]
     table = {row[0]: dict(zip(head, row, strict=True)) for row in body}
     assert tuple(table) == Params._fields  # in their order
-    assert {name: row["Unit"] for name, row in table.items()} == UNITS
+    assert {name: row["Unit"] for name, row in table.items()} == {
+        name: row.unit for name, row in TABLE.items()
+    }
     for sensor in SENSORS:
         told = {name: row[sensor] for name, row in table.items()}
         assert all(map(number.fullmatch, told.values()))

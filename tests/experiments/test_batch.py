@@ -22,7 +22,7 @@ def log():
     return planar(
         seed=3, landmarks=8, length_m=3.0, odometry_hz=10, rate_hz=5, outlier=0.0, detection=1.0,
         view=(-np.pi, np.pi, 30.0), mounting=(0.2, -0.1, 0.5), floor_tran=0.01, floor_rot=0.01,
-        growth=0.03, start_cov=np.diag([0.01, 0.02, 0.03]) ** 2, **noise,
+        landmark_extent=0.03, start_cov=np.diag([0.01, 0.02, 0.03]) ** 2, **noise,
     )  # fmt: skip
 
 
@@ -76,7 +76,7 @@ def test_same_solution_as_scipy(log):
     who = data.measurements.identity[frame, slot]
     sensor = batch.compose(found.pose, batch.mounting(params))
     square = ((found.landmarks[who] - sensor[frame, :2]) ** 2).sum(1)
-    variance = params.sigma_bearing**2 + params.growth**2 / square
+    variance = params.sigma_bearing**2 + params.landmark_extent**2 / square
     pose, landmarks = independent(log, params, variance, found.weight)
     np.testing.assert_allclose(found.pose[:, :2], pose[:, :2], atol=2e-3)
     np.testing.assert_allclose(wrap(found.pose[:, 2] - pose[:, 2]), 0, atol=2e-3)

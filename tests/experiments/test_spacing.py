@@ -74,7 +74,9 @@ def test_with_known_identities_the_ekf_is_exact_and_knows_how_exact():
         found = rivals.run(log, default_params("bearing", log), "known")
         true = metrics.truth_at(log.truth, log.frame_time)
         squares.append(np.mean(metrics.nees(found.pose, found.cov, true)))
-        told = spacing.measures(log, found.pose, found.row, found.landmark_id, found.mean, found.identity)
+        told = spacing.measures(
+            log, found.pose, found.row, found.landmark_id, found.mean, found.identity
+        )
         assert min(told["right"], told["one_to_one"]) > 0.95  # not 1: points are dropped, too
         assert (told["matched"], told["spurious"]) == (world.LINES, 0)
         errors.append((told["path_m"], told["landmark_m"]))
@@ -166,7 +168,9 @@ def test_both_ways_of_associating_map_lines_that_stand_apart():
     log = world.room(0, 1.0, 1, 20.0)
     for rule in ("nearest", "joint"):
         found = rivals.run(log, default_params("bearing", log), rule)
-        told = spacing.measures(log, found.pose, found.row, found.landmark_id, found.mean, found.identity)
+        told = spacing.measures(
+            log, found.pose, found.row, found.landmark_id, found.mean, found.identity
+        )
         assert told["right"] > 0.7
         assert told["path_m"] < 0.1
         assert told["matched"] > 18

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import multivariate_normal, norm
 from test_association import case, greedy
 
-from jaxslam.config import Config, default_params
+from jaxslam.config import Config
 from jaxslam.filter import appearance
 from jaxslam.filter.appearance import update_appearances
 from jaxslam.filter.association import CLUTTER, NEW, PADDING, associate
@@ -20,6 +20,7 @@ from jaxslam.logs import diagnostics
 from jaxslam.logs.appearance_space import fit_appearance_space
 from jaxslam.logs.log_file import save_log
 from jaxslam.models.sensors import Measurements
+from jaxslam.parameters import default_params
 from jaxslam.results.run_folder import errors
 from jaxslam.runs import run
 from jaxslam.simulation.planar import planar
@@ -187,7 +188,12 @@ def test_a_look_is_the_mean_of_its_sightings_and_ends_with_its_landmark(x64):
         if t == 3:
             np.testing.assert_allclose(known.mean[:, 2], seen[:4, 0].mean(0))
             np.testing.assert_allclose(known.mean[:, 0], seen[1:4:2, 2].mean(0))
-            assert known.weight.tolist() == [2, 2, 4, 0] and known.landmark_id.tolist() == [41, 40, 5, -1]
+            assert known.weight.tolist() == [2, 2, 4, 0] and known.landmark_id.tolist() == [
+                41,
+                40,
+                5,
+                -1,
+            ]
     assert known.weight.tolist() == [5, 5, appearance.LATEST, 0]  # not by what was not valid
     other = update_appearances(
         known, jnp.array([2, NEW, NEW]), jnp.array([6, NEW, NEW]), FULL, 20, frame
@@ -199,7 +205,9 @@ def test_a_look_is_the_mean_of_its_sightings_and_ends_with_its_landmark(x64):
     match, free = jnp.array([NEW, CLUTTER, NEW]), jnp.array([1, 3, 4])
     born = update_appearances(known, match, match, free, 30, frame)
     np.testing.assert_allclose(born.mean[:, [1, 3]].T, seen[0, [0, 2]])
-    assert born.weight[1] == born.weight[3] == 1 and born.landmark_id[jnp.array([1, 3])].tolist() == [
+    assert born.weight[1] == born.weight[3] == 1 and born.landmark_id[
+        jnp.array([1, 3])
+    ].tolist() == [
         90,
         92,
     ]

@@ -3,10 +3,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.config import Config, default_params
+from jaxslam.config import Config
 from jaxslam.filter.association import CLUTTER, NEW, PADDING, _possible, associate
 from jaxslam.filter.landmarks import Scorer, log_likelihoods
 from jaxslam.models.sensors import Measurements
+from jaxslam.parameters import default_params
 
 K, M, N = 5, 7, 300
 

@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.config import Config, default_params
+from jaxslam.config import Config
 from jaxslam.filter import step as fastslam
 from jaxslam.models.motion import Odometry, model
 from jaxslam.models.sensors import Measurements
+from jaxslam.parameters import default_params
 
 STEPS, RUNS, LANDMARKS = 6, 10_000, 3
 START = np.array([0.3, -0.2, 0.4])

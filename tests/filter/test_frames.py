@@ -5,11 +5,11 @@ import itertools
 import numpy as np
 import pytest
 
-from jaxslam.config import Params, default_params
 from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.log import Log
 from jaxslam.logs.log_file import load_log
 from jaxslam.logs.odometry import dead_reckoning, increments
+from jaxslam.parameters import Params, default_params
 
 S = 10**9
 
@@ -256,7 +256,7 @@ def numbers(**changes):
 
 
 def test_positions_made_of_range_and_bearing():
-    params = numbers(sigma_range=0.1, sigma_bearing=0.02, growth=0.03)
+    params = numbers(sigma_range=0.1, sigma_bearing=0.02, landmark_extent=0.03)
     m = frames_from_log(five(), "position", params=params).measurements
     r, b = 2.0, 0.3
     place = m.value[0, 2]
@@ -270,7 +270,7 @@ def test_positions_made_of_range_and_bearing():
 
 def test_noise_of_made_positions_is_the_declared_one():
     declared = frames_from_log(
-        five(noise={"sigma_range": 0.4, "growth": 0.0}), "position"
+        five(noise={"sigma_range": 0.4, "landmark_extent": 0.0}), "position"
     ).measurements
     given = numbers(sigma_range=0.4, sigma_bearing=default_params("position").sigma_bearing)
     same = frames_from_log(five(), "position", params=given).measurements

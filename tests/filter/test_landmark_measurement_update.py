@@ -25,7 +25,7 @@ def jacobian(sensor, mean, anchor, h=1e-6):
 def kalman(sensor, mean, cov, anchor, value):
     """Textbook EKF in covariance form: mean, covariance, log density of the measurement."""
     expected, r = predict(sensor, mean, anchor)
-    bearing_var = PARAMS.sigma_bearing**2 + (PARAMS.growth / r) ** 2
+    bearing_var = PARAMS.sigma_bearing**2 + (PARAMS.landmark_extent / r) ** 2
     xx, xy, yy = PARAMS.position_scale**2 * np.array(COV)
     noise = {
         "bearing": np.array([[bearing_var]]),
@@ -71,16 +71,16 @@ def test_a_well_known_bearing_landmark_is_a_kalman_filter(x64, seed):
     assert float(density) == pytest.approx(want_density, abs=1e-3)
 
 
-def on_a_grid(first, sigma, growth, values, x, size=200):
+def on_a_grid(first, sigma, landmark_extent, values, x, size=200):
     """Mean and covariance of (direction, inverse depth) given bearings at (x, 0), sensor ahead."""
     phi = (first + np.linspace(-5, 5, size) * sigma)[:, None]
     rho = np.linspace(1e-3, PARAMS.inv_depth_mean + 5 * PARAMS.inv_depth_sd, size)[None]
-    log_p = -0.5 * ((phi - first) ** 2 / (sigma**2 + growth**2 * rho**2))
-    log_p = log_p - 0.5 * np.log(sigma**2 + growth**2 * rho**2)
+    log_p = -0.5 * ((phi - first) ** 2 / (sigma**2 + landmark_extent**2 * rho**2))
+    log_p = log_p - 0.5 * np.log(sigma**2 + landmark_extent**2 * rho**2)
     log_p = log_p - 0.5 * ((rho - PARAMS.inv_depth_mean) / PARAMS.inv_depth_sd) ** 2
     for value, at in zip(values, x, strict=True):
         dx, dy = np.cos(phi) - rho * at, np.sin(phi)
-        variance = sigma**2 + growth**2 * rho**2 / (dx**2 + dy**2)
+        variance = sigma**2 + landmark_extent**2 * rho**2 / (dx**2 + dy**2)
         log_p = log_p - 0.5 * wrap(value - np.arctan2(dy, dx)) ** 2 / variance
         log_p = log_p - 0.5 * np.log(variance)
     p = np.exp(log_p - log_p.max())
@@ -97,14 +97,14 @@ def on_a_grid(first, sigma, growth, values, x, size=200):
 def test_a_bearing_landmark_stays_with_the_exact_posterior(ahead):
     """2 m driven past it or towards it, depth drawn from the prior: expected NEES under the exact
     posterior, which should be 2. One EKF has hundreds straight ahead."""
-    rng, draws, sigma, growth = np.random.default_rng(5), 40, np.deg2rad(4), 0.02
-    params = PARAMS._replace(sigma_bearing=float(sigma), growth=growth)
+    rng, draws, sigma, landmark_extent = np.random.default_rng(5), 40, np.deg2rad(4), 0.02
+    params = PARAMS._replace(sigma_bearing=float(sigma), landmark_extent=landmark_extent)
     first = np.deg2rad(ahead)
     rho = np.abs(rng.normal(params.inv_depth_mean, params.inv_depth_sd, draws))
-    phi = first + rng.normal(size=draws) * np.hypot(sigma, growth * rho)
+    phi = first + rng.normal(size=draws) * np.hypot(sigma, landmark_extent * rho)
     x = 0.1 * np.arange(1, 21)
     dx, dy = np.cos(phi) - rho * x[:, None], np.sin(phi) + 0 * x[:, None]
-    noise = np.sqrt(sigma**2 + growth**2 * rho**2 / (dx**2 + dy**2))
+    noise = np.sqrt(sigma**2 + landmark_extent**2 * rho**2 / (dx**2 + dy**2))
     values = np.arctan2(dy, dx) + noise * rng.normal(size=dx.shape)
 
     zero = jnp.zeros(draws)
@@ -121,7 +121,7 @@ def test_a_bearing_landmark_stays_with_the_exact_posterior(ahead):
     cov = np.moveaxis(matrix(np.asarray(geometry.covariance(factor), float)), -1, 0)
     nees = []
     for i in range(draws):
-        exact_mean, exact_cov = on_a_grid(first, sigma, growth, values[:, i], x)
+        exact_mean, exact_cov = on_a_grid(first, sigma, landmark_extent, values[:, i], x)
         off = exact_mean - np.asarray(mean, float)[:, i]
         nees.append(np.trace(np.linalg.solve(cov[i], exact_cov + np.outer(off, off))))
     assert 1.0 < np.median(nees) < 3.0

@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.config import Config, Params, default_params
+from jaxslam.config import Config
 from jaxslam.filter import candidate_slots, lazy_resampling
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.frames import frames_from_log
 from jaxslam.filter.landmarks import Landmarks
 from jaxslam.filter.xla import nonzero_indices
+from jaxslam.parameters import Params, default_params
 from jaxslam.simulation.planar import planar
 
 PARTICLES, SLOTS = 64, 48

@@ -68,9 +68,9 @@ def test_the_summary_is_the_mixture_over_the_particles(x64, sensor):
     if sensor == "bearing":
         factor[2, 4, best] = 5.0  # of unknown depth
         factor[2, 0, 0] = 5.0  # and one that another particle must not average in
-        landmark_id[[0, *np.flatnonzero(landmark_id[:, 0] == landmark_id[0, best])], 0] = landmark_id[
-            [*np.flatnonzero(landmark_id[:, 0] == landmark_id[0, best]), 0], 0
-        ]
+        landmark_id[[0, *np.flatnonzero(landmark_id[:, 0] == landmark_id[0, best])], 0] = (
+            landmark_id[[*np.flatnonzero(landmark_id[:, 0] == landmark_id[0, best]), 0], 0]
+        )
         count[0, 0] = 2
     world = world._replace(
         landmark_id=jnp.asarray(landmark_id),

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from test_exact import START, START_COV, problem
 
-from jaxslam.config import SENSORS, Config, default_params
+from jaxslam.config import SENSORS, Config
 from jaxslam.filter import proposal
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.association import CLUTTER, NEW
 from jaxslam.logs.odometry import Odometry
 from jaxslam.models import motion, sensors
 from jaxslam.models.sensors import Measurements
+from jaxslam.parameters import default_params
 
 ODOMETRY = Odometry(0.3, 0.05, 0.2, 0.32, 0.25, 0.5, 0.4, 0.1)
 
@@ -169,8 +170,8 @@ def drive_among_marks(sensor, steps=5):
     full = np.full(steps, 1.0)
     odometry = Odometry(ahead, 0 * full, turn, ahead, turn, full, full / 2, full / 12)
     params = default_params(sensor)._replace(
-        err_tran=0.15, err_rot=0.2, err_drift=0.1, sigma_bearing=0.04, growth=0.0, sigma_range=0.1,
-        correlation=0.0, caution=0.0,
+        err_tran=0.15, err_rot=0.2, err_drift=0.1, sigma_bearing=0.04, landmark_extent=0.0, sigma_range=0.1,
+        correlation=0.0, extra_bearing_noise=0.0,
     )  # fmt: skip
     pose, values = np.zeros(3), []
     for t in range(steps):

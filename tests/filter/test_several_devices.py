@@ -14,8 +14,9 @@ import pytest
 from test_appearance import coloured
 
 from jaxslam.cli import main as cli
-from jaxslam.config import Config, default_params
+from jaxslam.config import Config
 from jaxslam.logs.log_file import save_log
+from jaxslam.parameters import default_params
 from jaxslam.runs import checkpoints, cluster
 from jaxslam.runs.cluster import ClusterAddress
 from jaxslam.simulation.planar import planar

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.config import SENSORS, Config, default_params
+from jaxslam.config import SENSORS, Config
 from jaxslam.filter import association
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.frames import frames_from_log
 from jaxslam.models import motion
+from jaxslam.parameters import default_params
 from jaxslam.results.metrics import ate
 from jaxslam.runs.run import config_for, run
 from jaxslam.simulation.planar import planar

@@ -3,11 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.config import default_params
 from jaxslam.filter import landmarks
+from jaxslam.parameters import default_params
 
 PARAMS = default_params()._replace(
-    growth=0.02, position_scale=1.3, mount_x=0.2, mount_yaw=0.1, caution=0.0
+    landmark_extent=0.02, position_scale=1.3, mount_x=0.2, mount_yaw=0.1, extra_bearing_noise=0.0
 )
 COV = (0.04, -0.015, 0.02)  # of a position: correlated
 SENSOR_POSE = np.array([0.5, -0.3, 0.8])

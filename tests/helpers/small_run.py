@@ -4,8 +4,9 @@ import dataclasses
 
 import numpy as np
 
-from jaxslam.config import Config, Params
+from jaxslam.config import Config
 from jaxslam.logs.log import FloorPlan, Log, Truth
+from jaxslam.parameters import Params
 from jaxslam.results.result import MapEstimate, Result
 from jaxslam.smoother.genealogy import Ancestral, Lineage
 from jaxslam.smoother.refine import Refined

@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxslam.config import Config, default_params
+from jaxslam.config import Config
 from jaxslam.learning import error_models, transforms
 from jaxslam.learning import fit as learn
 from jaxslam.learning.error_models import NAMES, Judged, compare, model_of, preferred, table
+from jaxslam.parameters import default_params
 from jaxslam.runs.run import config_for
 from jaxslam.simulation import planar
 
@@ -20,33 +21,38 @@ def drive(seed=1, **settings):
 
 
 @pytest.mark.parametrize(
-    ("model", "names", "clutter", "growth"),
+    ("model", "names", "clutter", "landmark_extent"),
     [
         ("normal", "sigma_range sigma_bearing", False, 0),
-        ("range_dependent", "sigma_range sigma_bearing growth", False, 0.12),
+        ("range_dependent", "sigma_range sigma_bearing landmark_extent", False, 0.12),
         ("heavy_tailed", "sigma_range sigma_bearing outlier", True, 0),
-        ("heavy_tailed+range_dependent", "sigma_range sigma_bearing growth outlier", True, 0.12),
+        (
+            "heavy_tailed+range_dependent",
+            "sigma_range sigma_bearing landmark_extent outlier",
+            True,
+            0.12,
+        ),
         ("point", "position_scale", False, 0.12),
     ],
 )
-def test_what_a_model_learns(model, names, clutter, growth):
+def test_what_a_model_learns(model, names, clutter, landmark_extent):
     config, params, found = model_of(model, Config(), default_params())
     assert found == tuple(names.split())
     assert config.clutter == clutter
     assert config.sensor == ("position" if model == "point" else "range_bearing")
-    assert params.growth == growth
+    assert params.landmark_extent == landmark_extent
     bearing = model_of(model, Config(sensor="bearing"), default_params("bearing"))
     if model != "point":
         assert bearing[2] == found[1:]
-        assert bearing[1].caution == 0
+        assert bearing[1].extra_bearing_noise == 0
         assert bearing[1].sigma_bearing == pytest.approx(np.hypot(0.005, 0.06))
 
 
 def test_what_is_learnt_as_a_logarithm_starts_above_zero():
-    none = default_params()._replace(growth=0.0, outlier=0.0)
+    none = default_params()._replace(landmark_extent=0.0, outlier=0.0)
     _, params, names = model_of("heavy_tailed+range_dependent", Config(), none)
     assert np.isfinite(transforms.free_vector(params, names)).all()
-    assert (params.growth, params.outlier) == (0.02, 0.01)
+    assert (params.landmark_extent, params.outlier) == (0.02, 0.01)
 
 
 def rows(*means, spread=1.0, count=100):
@@ -108,19 +114,19 @@ def test_a_point_is_as_likely_as_its_range_and_bearing(monkeypatch):
 @pytest.mark.parametrize(
     ("sensor", "settings", "best", "name", "true"),
     [
-        ("range_bearing", {"growth": 0.2}, "range_dependent", "growth", 0.2),
-        ("bearing", {"growth": 0.2}, "range_dependent", "growth", 0.2),
+        ("range_bearing", {"landmark_extent": 0.2}, "range_dependent", "landmark_extent", 0.2),
+        ("bearing", {"landmark_extent": 0.2}, "range_dependent", "landmark_extent", 0.2),
         ("range_bearing", {}, "normal", "sigma_bearing", 0.02),
     ],
 )
 def test_the_model_that_made_the_data_wins(sensor, settings, best, name, true):
     train, judge = drive(1, **settings), drive(2, **settings)
     config = config_for(train, sensor, "known", particles=100, proposal="informed")
-    params = default_params(sensor, train)._replace(growth=0.05, outlier=0.01)
+    params = default_params(sensor, train)._replace(landmark_extent=0.05, outlier=0.01)
     found = compare([train], [judge], config, params, ("err_drift",), seeds=2, steps=40)
     by_name = {row.model: row for row in found}
     means = {row.model: row.evidence.mean() for row in found if row.model != "point"}
     assert means[best] >= max(means.values()) - 2
     assert by_name[best].values[name] == pytest.approx(true, rel=0.4)
-    if "growth" in settings:
+    if "landmark_extent" in settings:
         assert means[best] > means["normal"] + 5

@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.config import Config, Params, default_params
+from jaxslam.config import Config
 from jaxslam.filter import step as fastslam
 from jaxslam.learning import fit, likelihood, transforms
 from jaxslam.logs.odometry import Odometry
 from jaxslam.models.sensors import Measurements
+from jaxslam.parameters import Params, default_params
 from jaxslam.simulation import planar
 
 NAMES = ("sigma_bearing", "sigma_range", "mount_yaw")
@@ -51,8 +52,10 @@ def test_the_free_scale_there_and_back(x64, name):
 
 
 def test_what_starts_at_zero_has_no_logarithm(start):
-    with pytest.raises(ValueError, match="growth is 0: to be learnt it must start above 0"):
-        transforms.free_vector(start, ("growth",))
+    with pytest.raises(
+        ValueError, match="landmark_extent is 0: to be learnt it must start above 0"
+    ):
+        transforms.free_vector(start, ("landmark_extent",))
 
 
 def test_the_usual_choice_leaves_the_scale_to_the_odometry_when_there_are_bearings_only():
@@ -109,7 +112,11 @@ def test_bounds_hold_and_priors_pull(logs, start):
     [
         ((), {}, "parameters to learn: none"),
         (("sigma_range", "sigma_range"), {}, "name each once"),
-        (("caution",), {}, "'caution' can't be learnt with sensor range_bearing; these can: err"),
+        (
+            ("extra_bearing_noise",),
+            {},
+            "'extra_bearing_noise' can't be learnt with sensor range_bearing; these can: err",
+        ),
         (("sigma_range",), {"bounds": {"sigma_range": (1.0, 2.0)}}, "outside its bounds 1 to 2"),
         (("sigma_range",), {"priors": {"err_rot": (1.0, 2.0)}}, "err_rot has bounds or a prior"),
         (("sigma_range",), {"seeds": 0}, "seeds is 0; must be 1 or more"),
@@ -145,11 +152,11 @@ def test_two_devices_give_what_one_gives(pytestconfig):
     np.testing.assert_allclose(two, one, rtol=2e-3)
 
 
-@pytest.mark.parametrize("even", [False, True])
+@pytest.mark.parametrize("uniform_association_prior", [False, True])
 def test_a_landmark_held_twice_gains_nothing_where_association_is_even(x64, even):
     config = Config(
-        sensor="position", association="sampled", even=even, clutter=False, forgetting=False,
-        particles=1, landmarks=8, measurements=1, resample_threshold=0,
+        sensor="position", association="sampled", uniform_association_prior=even, clutter=False,
+        forgetting=False, particles=1, landmarks=8, measurements=1, resample_threshold=0,
     )  # fmt: skip
     steps, zero = 5, np.zeros(5)
     params = default_params("position")._replace(

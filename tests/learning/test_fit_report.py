@@ -5,12 +5,13 @@ import csv
 import numpy as np
 import pytest
 
-from jaxslam.config import Config, default_params
+from jaxslam.config import Config
 from jaxslam.learning import report as learn_report
 from jaxslam.learning import surface
 from jaxslam.learning.fit import Fit, History
 from jaxslam.learning.report import Judged
 from jaxslam.learning.uncertainty import Uncertainty
+from jaxslam.parameters import default_params
 
 NAMES = ("err_rot", "sigma_bearing", "mount_yaw")
 STEPS = 20

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from test_proposal import ODOMETRY, drive_among_marks
 
-from jaxslam.config import Config, default_params
+from jaxslam.config import Config
 from jaxslam.filter import blocks, resampling
 from jaxslam.filter import step as fastslam
 from jaxslam.learning import likelihood
-from jaxslam.learning.likelihood import OF_MOTION, Data
+from jaxslam.learning.likelihood import Data
 from jaxslam.models import motion
+from jaxslam.parameters import default_params, learned_by
 from jaxslam.simulation.planar import planar
 
 KEY = jax.random.key(4)
@@ -48,9 +49,9 @@ def among_marks(sensor, steps):
         measurements = measurements._replace(value=value, cov=cov, scale=scale)
     params = default_params(sensor)._replace(
         err_tran=0.15, err_rot=0.2, err_drift=0.1, floor_tran=0.1, floor_rot=0.05, gain_tran=1.05,
-        gain_rot=0.9, bias_drift=0.02, sigma_range=0.1, sigma_bearing=0.08, growth=0.05,
+        gain_rot=0.9, bias_drift=0.02, sigma_range=0.1, sigma_bearing=0.08, landmark_extent=0.05,
         position_scale=1.2, mount_x=0.1, mount_y=-0.05, mount_yaw=0.1, outlier=0.1,
-        density_new=0.05, view_range=4.0, correlation=0.5, caution=0.03,
+        density_new=0.05, view_range=4.0, correlation=0.5, extra_bearing_noise=0.03,
     )  # fmt: skip
     start = np.array([0.02, 0.01, 0.0]), np.diag([0.01, 0.02, 0.01])
     given = tuple(part[:, :2] + 0.1 * (i == 1) for i, part in enumerate(given))
@@ -168,10 +169,10 @@ def test_grad_is_the_score_of_what_is_learnable(x64, scored):
     for name, slope in gradient._asdict().items():
         wanted = found.total[names.index(name)] if name in names else 0.0
         np.testing.assert_allclose(slope, wanted, rtol=1e-10, err_msg=name)
-        assert slope != 0 or name not in names or name == "growth"  # which is 0 here
+        assert slope != 0 or name not in names or name == "landmark_extent"  # which is 0 here
 
 
-@pytest.mark.parametrize("name", ["err_rot", "sigma_bearing", "caution"])
+@pytest.mark.parametrize("name", ["err_rot", "sigma_bearing", "extra_bearing_noise"])
 def test_grad_by_one_parameter(x64, scored, name):
     log, params, config, names, found = scored
 
@@ -238,8 +239,8 @@ def test_the_motions_score_is_the_slope_of_its_density(x64):
     )  # fmt: skip
     before, u = (0.4, -0.3, 0.7), np.random.default_rng(0).normal(size=(3, 5))
     after = motion.sample(before, ODOMETRY, params, u)
-    found = likelihood.motion_score(u, ODOMETRY, params, OF_MOTION)
-    for name in OF_MOTION:
+    found = likelihood.motion_score(u, ODOMETRY, params, learned_by("motion"))
+    for name in learned_by("motion"):
         value, step = getattr(params, name), 1e-6
         more, less = (
             motion.log_density(after, before, ODOMETRY, params._replace(**{name: value + s}))
@@ -253,7 +254,7 @@ def test_directions_without_noise_have_no_score(x64):
         err_tran=0.1, floor_tran=0.05, err_rot=0.0, err_drift=0.0, floor_rot=0.0, gain_tran=1.1
     )
     u = np.random.default_rng(0).normal(size=(3, 50_000))
-    found = likelihood.motion_score(u, ODOMETRY, params, OF_MOTION)
+    found = likelihood.motion_score(u, ODOMETRY, params, learned_by("motion"))
     for name in ("err_rot", "err_drift", "floor_rot"):
         assert (found[name] == 0).all()
     for name in ("err_tran", "floor_tran", "gain_tran"):  # a score's mean is zero
@@ -264,7 +265,10 @@ def test_directions_without_noise_have_no_score(x64):
 def test_what_is_refused():
     log, params, config = small()
     for names, told in (
-        (("caution",), "'caution' can't be learnt with sensor range_bearing; these can: err_tran,"),
+        (
+            ("extra_bearing_noise",),
+            "'extra_bearing_noise' can't be learnt with sensor range_bearing; these can: err_tran,",
+        ),
         (("inv_depth_sd",), "'inv_depth_sd' can't be learnt"),
         (("position_scale",), "'position_scale' can't be learnt"),
     ):

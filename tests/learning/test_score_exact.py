@@ -15,11 +15,12 @@ import pytest
 import test_exact
 from test_proposal import enumerated
 
-from jaxslam.config import Config, default_params
+from jaxslam.config import Config
 from jaxslam.filter import association
 from jaxslam.learning import likelihood
 from jaxslam.logs.odometry import Odometry
 from jaxslam.models.sensors import Measurements
+from jaxslam.parameters import default_params
 
 NAMES = ("err_tran", "floor_tran", "gain_tran", "position_scale", "outlier", "density_new")
 START, START_COV = np.array([0.3, -0.2, 0.4]), np.diag([0.02, 0.03, 0.0])
@@ -31,7 +32,7 @@ RESAMPLE = 0.8  # of the particles
 OF = ((0,), (1, 2), (2,), (2,))  # the landmark of each frame's measurements
 PARAMS = default_params("position")._replace(
     err_tran=0.3, floor_tran=0.15, err_rot=0.0, err_drift=0.0, floor_rot=0.0, gain_tran=1.1,
-    correlation=0.0, caution=0.0, outlier=0.1, density_new=0.03, view_range=2.5,
+    correlation=0.0, extra_bearing_noise=0.0, outlier=0.1, density_new=0.03, view_range=2.5,
 )  # fmt: skip
 
 

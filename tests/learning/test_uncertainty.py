@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from jaxslam.config import Config, default_params
+from jaxslam.config import Config
 from jaxslam.learning import fit as learn
 from jaxslam.learning import transforms, uncertainty
+from jaxslam.parameters import TABLE, default_params
 
 INFORMATION = np.array([[40.0, 10.0], [10.0, 20.0]])
 
@@ -107,5 +108,5 @@ def test_the_step_after_a_fit_is_taken_on_the_free_scale():
     )  # fmt: skip
     found = uncertainty.improve(fit, errors).params
     assert found.err_rot == pytest.approx(0.2)
-    assert found.mount_yaw == pytest.approx(0.5 * transforms.SCALE["mount_yaw"])
+    assert found.mount_yaw == pytest.approx(0.5 * TABLE["mount_yaw"].step)
     assert found.err_drift == params.err_drift

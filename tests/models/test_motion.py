@@ -3,9 +3,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.config import default_params
 from jaxslam.models import motion
 from jaxslam.models.motion import Odometry
+from jaxslam.parameters import default_params
 
 QUIET = default_params()._replace(
     err_tran=0.0, err_rot=0.0, err_drift=0.0, floor_tran=0.0, floor_rot=0.0

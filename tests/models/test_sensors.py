@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.config import SENSORS, Config, default_params
+from jaxslam.config import SENSORS, Config
 from jaxslam.models import geometry, sensors
+from jaxslam.parameters import default_params
 from jaxslam.reference import fastslam
 
-PARAMS = default_params()._replace(mount_x=0.2, mount_y=-0.1, mount_yaw=0.3, growth=0.02)
+PARAMS = default_params()._replace(mount_x=0.2, mount_y=-0.1, mount_yaw=0.3, landmark_extent=0.02)
 COV = (0.04, 0.01, 0.02)
 
 
@@ -154,7 +155,7 @@ def test_correlated_noise_is_that_of_an_autoregression_averaged(x64):
     )
     apart = 0.1 * np.abs(np.subtract.outer(np.arange(1500), np.arange(1500)))
     inflation = np.exp(-apart / 0.4).sum() / 1500
-    for name in ("sigma_range", "sigma_bearing", "growth", "position_scale"):
+    for name in ("sigma_range", "sigma_bearing", "landmark_extent", "position_scale"):
         ratio = float(getattr(noisy, name)) / getattr(params, name)
         assert ratio**2 == pytest.approx(inflation, rel=0.01)
     assert noisy.outlier == params.outlier
@@ -186,5 +187,5 @@ def test_correlated_noise_is_the_baselines(x64, distance):
     moved = SimpleNamespace(distance=distance, turn=distance / 2)
     noisy = sensors.correlated_noise(params, moved)
     model = fastslam.with_extra_noise(fastslam.make_model(params, Config()), moved)
-    for name in ("sigma_range", "sigma_bearing", "growth", "position_scale"):
+    for name in ("sigma_range", "sigma_bearing", "landmark_extent", "position_scale"):
         assert getattr(model, name) == pytest.approx(float(getattr(noisy, name)), rel=1e-9)

@@ -9,8 +9,8 @@ import jax
 jax.config.update("jax_num_cpu_devices", 4)
 import numpy as np
 
-from jaxslam.config import default_params
 from jaxslam.logs.log_file import load_log
+from jaxslam.parameters import default_params
 from jaxslam.results import run_folder
 from jaxslam.runs import batch, compiled, run
 from jaxslam.runs.run import config_for

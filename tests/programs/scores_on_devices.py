@@ -12,8 +12,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "learning"))
 from test_fit import CONFIG, NAMES, drive
 
-from jaxslam.config import Params, default_params
 from jaxslam.learning import fit, transforms
+from jaxslam.parameters import Params, default_params
 
 logs = [drive(1), drive(2), drive(3)]
 params = default_params("range_bearing", logs[0])

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.config import SENSORS, Config, default_params
+from jaxslam.config import SENSORS, Config
 from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.log_file import load_log
+from jaxslam.parameters import default_params
 from jaxslam.reference import compare, fastslam, variants
 from jaxslam.simulation import planar
 

@@ -9,7 +9,7 @@ import pytest
 from jaxslam.reference import ekf
 
 SENSORS = ("position", "range_bearing", "bearing")
-NOISE = {"sigma_range": 0.1, "sigma_bearing": 0.05, "growth": 0.03, "position_scale": 1.5}
+NOISE = {"sigma_range": 0.1, "sigma_bearing": 0.05, "landmark_extent": 0.03, "position_scale": 1.5}
 NEWBORN = {"inv_depth_mean": 0.3, "inv_depth_sd": 0.2, "existence_new": 1.0}
 
 

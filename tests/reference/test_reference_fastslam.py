@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxslam.config import Config, default_params
+from jaxslam.config import Config
+from jaxslam.parameters import default_params
 from jaxslam.reference import compare, ekf, fastslam
 from jaxslam.simulation import planar
 
@@ -15,8 +16,8 @@ STILL = {"dx": 0, "dy": 0, "dtheta": 0, "distance": 0, "turn": 0, "duration": 0}
 STILL |= {"lever": 0.5, "lever_var": 1 / 12}
 MOTION = {"err_tran": 0, "err_rot": 0, "err_drift": 0, "floor_tran": 0, "floor_rot": 0}
 MOTION |= {"gain_tran": 1, "gain_rot": 1, "bias_drift": 0}
-SENSING = {"sigma_range": 0.1, "sigma_bearing": 0.05, "growth": 0.03, "position_scale": 1}
-SENSING |= {"correlation": 0.0, "caution": 0.0}
+SENSING = {"sigma_range": 0.1, "sigma_bearing": 0.05, "landmark_extent": 0.03, "position_scale": 1}
+SENSING |= {"correlation": 0.0, "extra_bearing_noise": 0.0}
 SENSING |= {"mount_x": 0.2, "mount_y": -0.1, "mount_yaw": 0.3, "outlier": 0.02, "density_new": 0.1}
 SENSING |= {"detection": 0.9, "view_min": -2.0, "view_max": 2.0, "view_range": 10.0}
 SENSING |= {"inv_depth_mean": 0.3, "inv_depth_sd": 0.2}
@@ -265,7 +266,9 @@ def test_small_world(sensor, association):
         polar = np.column_stack([r, b])
         frames.append({"position": point, "range_bearing": polar, "bearing": b}[sensor])
         truth.append(pose)
-    params = make_params(err_tran=0.05, err_rot=0.03, floor_tran=0.003, floor_rot=0.003, growth=0)
+    params = make_params(
+        err_tran=0.05, err_rot=0.03, floor_tran=0.003, floor_rot=0.003, landmark_extent=0
+    )
     rules = {"sensor": sensor, "association": association, "resample_threshold": 0.5}
     config = make_config(**rules, landmarks=6, forgetting=association != "known")
     cov = (0.02, 0.0, 0.02)
@@ -298,7 +301,7 @@ def test_small_world(sensor, association):
 def test_correlated_and_further_errors_as_in_the_filter(sensor):
     log = planar.planar(length_m=4.0, landmarks=12, seed=3)
     config = Config(sensor=sensor, particles=4, measurements=6, landmarks=10)
-    plain = default_params(sensor, log)._replace(correlation=0.0, caution=0.0)
+    plain = default_params(sensor, log)._replace(correlation=0.0, extra_bearing_noise=0.0)
 
     def check(**noise):
         found = compare.agreement(log, config, plain._replace(**noise), seed=1)
@@ -308,5 +311,5 @@ def test_correlated_and_further_errors_as_in_the_filter(sensor):
 
     white, correlated = check(), check(correlation=0.3)
     assert np.abs(correlated - white).max() > 1e-3
-    assert np.abs(check(caution=0.1) - white).max() > 1e-3
-    assert np.abs(check(correlation=0.3, caution=0.1) - correlated).max() > 1e-3
+    assert np.abs(check(extra_bearing_noise=0.1) - white).max() > 1e-3
+    assert np.abs(check(correlation=0.3, extra_bearing_noise=0.1) - correlated).max() > 1e-3

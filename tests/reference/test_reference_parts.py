@@ -16,7 +16,7 @@ STILL |= {"lever": 0.5, "lever_var": 1 / 12}
 MOTION = {"err_tran": 0, "err_rot": 0, "err_drift": 0, "floor_tran": 0, "floor_rot": 0}
 MOTION |= {"gain_tran": 1, "gain_rot": 1, "bias_drift": 0}
 SENSING = {"outlier": 0.02, "density_new": 0.1, "view_min": -2, "view_max": 2, "view_range": 10}
-SENSING |= {"sigma_bearing": 0.05, "caution": 0.0}
+SENSING |= {"sigma_bearing": 0.05, "extra_bearing_noise": 0.0}
 
 
 def make_model(config=None, **changes):

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from small_run import LANDMARKS, START, make_log, make_refined, make_result
 
-from jaxslam.config import Config, Params
+from jaxslam.config import Config
 from jaxslam.logs.log import Truth
 from jaxslam.logs.log_file import save_log
+from jaxslam.parameters import Params
 from jaxslam.results import load, metrics, run_folder
 from jaxslam.results.events import list_events as events_of
 from jaxslam.results.tables import error_table

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from jaxslam.cli import main as cli
-from jaxslam.config import default_params
 from jaxslam.logs.log_file import load_log
 from jaxslam.logs.slicing import cut
+from jaxslam.parameters import default_params
 from jaxslam.runs import batch, compiled, run
 
 CONFIG = dict(particles=30, landmarks=30, measurements=10)  # test_offline's: compiled once

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from test_appearance import coloured
 
-from jaxslam.config import default_params
 from jaxslam.logs.log_file import save_log
+from jaxslam.parameters import default_params
 from jaxslam.results import load, run_folder, run_lock
 from jaxslam.runs import checkpoint_file, compiled, run
 from jaxslam.runs import checkpoints as offline

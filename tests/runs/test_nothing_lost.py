@@ -6,9 +6,9 @@ import signal
 import numpy as np
 import pytest
 
-from jaxslam.config import default_params
 from jaxslam.logs.log_file import save_log
 from jaxslam.logs.slicing import cut
+from jaxslam.parameters import default_params
 from jaxslam.results import load
 from jaxslam.runs import batch, checkpoints, run
 from jaxslam.simulation.planar import planar

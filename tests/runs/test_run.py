@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.config import Config, default_params
+from jaxslam.config import Config
 from jaxslam.filter import new_landmarks
 from jaxslam.filter import step as fastslam
+from jaxslam.parameters import default_params
 from jaxslam.results.metrics import ate
 from jaxslam.runs import assemble, compiled
 from jaxslam.runs import run as runner

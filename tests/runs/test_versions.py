@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from jaxslam.cli import main as cli
-from jaxslam.config import default_params
 from jaxslam.learning import fit as learn
 from jaxslam.logs.log_file import load_log
 from jaxslam.parameter_file import load_learning, load_params
+from jaxslam.parameters import default_params
 from jaxslam.runs.run import config_for
 from jaxslam.vision.camera_files import load_camera
 

@@ -127,7 +127,9 @@ def predicted(log):
 @pytest.fixture(scope="module")
 def seen():
     """A log with a mounted sensor of limited view and much clutter."""
-    sensor = dict(sigma_range=0.08, sigma_bearing=0.015, growth=0.03, detection=0.7, outlier=0.15)
+    sensor = dict(
+        sigma_range=0.08, sigma_bearing=0.015, landmark_extent=0.03, detection=0.7, outlier=0.15
+    )
     return planar("grid", 3, **MANY, **sensor, view=(-1.0, 2.0, 7.0), mounting=(0.2, -0.1, 0.4))
 
 

@@ -6,11 +6,11 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from jaxslam.config import default_params
 from jaxslam.filter.frames import Frames, frames_from_log
 from jaxslam.logs.odometry import Odometry, dead_reckoning
 from jaxslam.logs.truth import wrap
 from jaxslam.models.sensors import Measurements
+from jaxslam.parameters import default_params
 from jaxslam.results.metrics import ate, pair_by_distance
 from jaxslam.simulation import planar
 from jaxslam.smoother import least_squares as bundle
@@ -48,7 +48,7 @@ def seen_from(pose, world):
 
 def params_of(sensor, **changes):
     given = dict(err_tran=0.2, err_rot=0.1, err_drift=0.1, floor_tran=0.02, floor_rot=0.02)
-    given |= dict(growth=0.0, outlier=0.0, correlation=0.0)
+    given |= dict(landmark_extent=0.0, outlier=0.0, correlation=0.0)
     return default_params(sensor)._replace(**given | changes)
 
 
@@ -211,7 +211,7 @@ def test_bearings_reach_the_optimum_of_another_solver(x64):
 def test_the_world_may_be_turned():
     """Turning and shifting the world turns and shifts the answer, covariances too."""
     data, pose = problem_of_bearings(np.random.default_rng(5))
-    params = params_of("bearing", sigma_bearing=0.03, growth=0.02, outlier=0.01)
+    params = params_of("bearing", sigma_bearing=0.03, landmark_extent=0.02, outlier=0.01)
     landmark_id, angle, shift = np.full((len(pose), 3), -1), 2.5, np.array([30.0, -7.0])
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     cov = np.diag([0.01, 0.02, 0.01])

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxslam.config import default_params
 from jaxslam.logs.log_file import load_log
+from jaxslam.parameters import default_params
 from jaxslam.simulation.room.render import double_mirror_camera, render_room
 from jaxslam.vision import extract as module
 from jaxslam.vision.extract import extract
