@@ -47,6 +47,11 @@ class Refined(NamedTuple):
     dropped: int
     residual: float
 
+    @property
+    def match(self):
+        """`landmark_id` by its name of version 0.1."""
+        return self.landmark_id
+
 
 class Solved(NamedTuple):
     """`bundle.Fit` of the last round and the `regroup.Groups` it is of; `merged`: pairs of labels,
