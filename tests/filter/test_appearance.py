@@ -21,7 +21,7 @@ from jaxslam.logs.appearance_space import fit_appearance_space
 from jaxslam.logs.log_file import save_log
 from jaxslam.models.sensors import Measurements
 from jaxslam.parameters import default_params
-from jaxslam.results.run_folder import errors
+from jaxslam.results.metrics import compute_errors as errors
 from jaxslam.runs import run
 from jaxslam.simulation.planar import planar
 

@@ -9,7 +9,7 @@ from jaxslam.cli import main as cli
 from jaxslam.logs.log_file import load_log
 from jaxslam.logs.slicing import cut
 from jaxslam.parameters import default_params
-from jaxslam.runs import batch, compiled, run
+from jaxslam.runs import batch, compiled, memory, run
 
 CONFIG = dict(particles=30, landmarks=30, measurements=10)  # test_offline's: compiled once
 
@@ -32,7 +32,7 @@ def three(woods):
 
 
 def state_bytes(config):
-    return batch.capacity.of_arrays(compiled.state_shapes(config))
+    return memory.bytes_of(compiled.state_shapes(config))
 
 
 def test_each_run_is_bit_for_bit_what_it_is_alone(woods, three):
