@@ -9,6 +9,7 @@ from jaxslam.cli import main as cli
 from jaxslam.logs.log_file import load_log
 from jaxslam.logs.slicing import cut
 from jaxslam.parameters import default_params
+from jaxslam.results.load import load_result
 from jaxslam.runs import batch, compiled, memory, run
 
 CONFIG = dict(particles=30, landmarks=30, measurements=10)  # test_offline's: compiled once
@@ -67,7 +68,7 @@ def test_saved_are_the_table_and_each_runs_folder(three, woods, tmp_path):
     with open(tmp_path / "all" / "runs.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [row["err_rot"] for row in rows] == ["0.05", "0.05", "0.2"]
-    again = batch.report.load(tmp_path / "all" / "seed-4-err_rot-0.05")
+    again = load_result(tmp_path / "all" / "seed-4-err_rot-0.05")
     np.testing.assert_array_equal(again.pose, results[1].pose)
     with pytest.raises(ValueError, match="exists; choose another"):
         batch.save(todo, results, tmp_path / "all")
