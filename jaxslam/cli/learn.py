@@ -189,9 +189,7 @@ def _config(parts, sensor, association, particles, landmarks):
     )
     dropped = {}
     for part in parts:
-        found = frames_from_log(
-            part, config.sensor, config.measurements, None, association == "known"
-        )
+        found = frames_from_log(part, config)
         for why, count in found.dropped.items():
             dropped[why] = dropped.get(why, 0) + count
     return config, dropped

@@ -77,9 +77,7 @@ def data_from_log(log, config, params=None, steps=None):
     Places are shifted so that the start is near the origin; float32 has 7 digits. Raises
     `ValueError` when the log can't supply what the configuration asks or has more steps.
     """
-    made = frames_from_log(
-        log, config.sensor, config.measurements, params, config.association == "known"
-    )
+    made = frames_from_log(log, dataclasses.replace(config, descriptors=0), params)
     total = len(made.time)
     steps = total if steps is None else steps
     if steps < total:

@@ -109,9 +109,7 @@ def agreement(log, config, params=None, seed=0, steps=None, double=True, progres
     params = Params(*map(float, params))
     if steps is not None:
         log = select_frames(log, np.arange(min(steps, len(log.frame_time))))
-    data = frames_from_log(
-        log, config.sensor, config.measurements, params, config.association == "known"
-    )
+    data = frames_from_log(log, config, params)
     if progress:
         progress(0, len(data.time))
     # The runner's local origin: float32 has 7 digits.

@@ -66,7 +66,7 @@ def run(log, config=None, params=None, seed=0, progress=None, refine=True, check
     config = config_for(log) if config is None else config
     params = default_params(config.sensor, log) if params is None else params
     params = validate(params, "params")
-    data = frames_of(log, config, params)
+    data = frames_from_log(log, config, params)
     if progress:
         progress(0, len(data.time), "")
     numbers = jax.tree.map(jnp.asarray, params)
@@ -118,7 +118,7 @@ def refine_result(result, progress=None):
     if past is None or not np.isfinite(past.pose).all():
         return result
     begin = time.perf_counter()
-    data = frames_of(log, dataclasses.replace(config, descriptors=0), result.params)
+    data = frames_from_log(log, dataclasses.replace(config, descriptors=0), result.params)
     try:
         found = refine(
             data, past.pose, past.landmark_id, log.start_pose, log.start_cov, result.params,
@@ -129,13 +129,6 @@ def refine_result(result, progress=None):
         return dataclasses.replace(result, refine_seconds=time.perf_counter() - begin)
     found = found._replace(identity=logged_identity(found.identity, data.identities))
     return dataclasses.replace(result, refined=found, refine_seconds=time.perf_counter() - begin)
-
-
-def frames_of(log, config, params):
-    """`Frames` of a log, as a configuration asks for them."""
-    known = config.association == "known"
-    sizes = config.measurements, params, known, config.descriptors
-    return frames_from_log(log, config.sensor, *sizes)
 
 
 def _filter(steps, key, at, data, params, config, renewal, progress, checkpoints):

@@ -12,6 +12,7 @@ from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.log_file import load_log
 from jaxslam.parameters import default_params
 from jaxslam.reference import compare, fastslam, variants
+from jaxslam.runs.run import config_for
 from jaxslam.simulation import planar
 
 STEPS, PARTICLES = 200, 20
@@ -53,7 +54,7 @@ def test_baseline_and_filter_agree(woods, sensor, association):
 
 
 def test_baseline_and_filter_agree_on_points_that_rest_on_odometry(woods):
-    f = frames_from_log(woods, "position", params=default_params("position", woods))
+    f = frames_from_log(woods, config_for(woods, "position"))
     cov = np.full((len(woods.frame), 3), np.nan)
     point, base = cov[:, :2].copy(), cov[:, 0].copy()
     rows = f.row[f.row >= 0]

@@ -10,6 +10,7 @@ from test_refine import births, room
 from jaxslam import run
 from jaxslam.config import Config
 from jaxslam.filter import map_estimate
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.odometry import Odometry
 from jaxslam.results.events import list_events
 from jaxslam.results.metrics import compute_errors
@@ -176,7 +177,7 @@ def test_hidden_bearings_become_the_map(log, found):
 
 def test_events_say_what_became_of_the_map(found):
     done, kind, label, into = found.events.T
-    assert set(done) <= set(rejuvenation.due_frames(runner.frames_of(
+    assert set(done) <= set(rejuvenation.due_frames(frames_from_log(
         found.log, found.config, found.params).odometry, found.config.rejuvenate))  # fmt: skip
     held = set()
     for which, a, b in zip(kind, label, into, strict=True):
