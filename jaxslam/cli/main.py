@@ -173,7 +173,6 @@ def compare(
     params: ParamFile = None,
     paper: Paper = False,
     particles: option(str, "particle counts of the baseline, by commas") = "20,100",
-    variants: at_least("particles of the second table's filters (0: no table)", 0) = 1000,
     steps: at_least("frames to filter") = 200,
     every: at_least("use each n-th frame (the steps cover a tenth)") | None = None,
     seed: Seed = 0,
@@ -181,8 +180,7 @@ def compare(
     """Show the filter beside the plain NumPy baseline: agreement, accuracy, time.
 
     Both get the same random draws. The baseline is slow: 20 particles over 200
-    steps take it some 10 seconds. A second table adds the paper's rules, FastSLAM
-    1.0, the informed proposal and refinement, with more particles.
+    steps take it some 10 seconds.
 
     Example: jaxslam compare lost-in-the-woods --particles 20,100 --steps 200
     """
@@ -198,13 +196,6 @@ def compare(
         with bar(f"{count} particles", compiles=True) as progress:
             rows.append(sides.compare(loaded, *model, seed, steps, every, progress))
     print(sides.table(rows))
-    if variants:
-        from jaxslam.reference import variants as rules
-
-        with bar("variants", compiles=True) as progress:
-            model = cli_run.build_model(loaded, sensor, association, variants, None, params, paper)
-            found = rules.variants(loaded, *model, seed, steps, every, rows, progress)
-        print(f"\n{rules.table(found)}")
     parted = [row.double for row in rows if row.double.same < row.double.steps]
     for row in parted:
         warn(f"{row.particles} particles: the two part at step {row.same}")
