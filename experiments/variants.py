@@ -15,9 +15,10 @@ import numpy as np
 
 from jaxslam.config import SENSORS, Config
 from jaxslam.logs.log_file import load_log
+from jaxslam.logs.slicing import select_frames
 from jaxslam.logs.truth import truth_at
 from jaxslam.parameters import default_params
-from jaxslam.reference.compare import compare, select_frames, thin
+from jaxslam.reference.compare import compare, thin
 from jaxslam.results.metrics import align_se2, alignable, ate, has_truth, map_error
 from jaxslam.runs import run
 from jaxslam.runs.run import config_for

@@ -7,7 +7,7 @@ be learnt, to `Params`.
 import math
 from dataclasses import dataclass
 
-SENSORS = ("position", "range_bearing", "bearing")
+SENSORS = ("range_bearing", "position", "bearing")  # a run takes the first that the log has
 ASSOCIATIONS = ("maximum_likelihood", "known", "sampled")
 PROPOSALS = ("prior", "informed")
 REJUVENATE = 3.0  # m

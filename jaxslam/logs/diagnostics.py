@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxslam.config import SENSORS
 from jaxslam.logs import clock_offset
-from jaxslam.logs.appearance_space import fit_appearance_space
 from jaxslam.logs.log import NOT_USED
 
 MOST_SPEED = 5.0  # m/s
@@ -57,7 +57,7 @@ def _measurements(log):
     empty = 100 * float((count == 0).mean())
     each = f"{n / frames:.1f} per frame, at most {count.max()}; {empty:.1f} % of frames empty"
     yield _say(n == 0, f"{n} measurements ({each})", "error")
-    sensors = [name for name in ("position", "range_bearing", "bearing") if log.has(name)]
+    sensors = [name for name in SENSORS if log.has(name)]
     yield Finding("ok", f"sensors it can supply: {', '.join(sensors)}")
     if log.point is not None and n:
         yield from _points(log)
@@ -175,7 +175,7 @@ def _identities(log):
 
 def _looks(log):
     if log.descriptor is not None and len(log.frame):
-        found = len(fit_appearance_space(log).within)
+        found = len(log.appearance_space.within)
         text = f"descriptors of {log.descriptor.shape[1]} columns: "
         told = f"{found} coordinates tell landmarks apart" if found else "tell no landmarks apart"
         yield Finding("ok", text + told)

@@ -8,6 +8,7 @@ the plan under `truth/` and `plan/`, and numbers under `noise/` and `skipped/`. 
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -150,6 +151,13 @@ class Log:
     def start(self):
         """Stamp [ns] at which `start_pose` holds: the first odometry or frame."""
         return min(int(self.odometry_time[0]), int(self.frame_time[0]))
+
+    @cached_property
+    def appearance_space(self):
+        """`AppearanceSpace` of the log's descriptors, fitted when first used."""
+        from jaxslam.logs.appearance_space import fit_appearance_space  # here: SciPy is slow
+
+        return fit_appearance_space(self)
 
     def has(self, sensor):
         """Whether the log can supply a sensor: position, range_bearing or bearing."""

@@ -70,15 +70,22 @@ def increments(log):
 
 def _arcs(log, bounds):
     """Frame, path [m] and turn [rad] of every step between stamps of odometry or frames."""
-    time = log.odometry_time
-    period = int(np.median(np.diff(time))) if len(time) > 1 else 0
-    edges = np.append(time, time[-1] + period)  # the last velocity is held for a usual period
+    edges, held = held_velocities(log)
     cuts = np.union1d(edges, bounds)
     cuts = cuts[(cuts >= bounds[0]) & (cuts <= bounds[-1])]
-    piece = np.searchsorted(edges, cuts[:-1], side="right")  # 0 and the last: the robot stands
-    velocity = np.vstack([[0.0, 0.0], log.odometry, [0.0, 0.0]])[piece]
+    velocity = held[np.searchsorted(edges, cuts[:-1], side="right")]
     travel, turn = (velocity * (np.diff(cuts) / 1e9)[:, None]).T
     return np.searchsorted(bounds[1:], cuts[1:]), travel, turn
+
+
+def held_velocities(log):
+    """Stamps [O + 1] at which the velocity changes, and the velocities [O + 2, 2] before, between
+    and after them: the robot stands before the first row, and holds the last for a median period.
+    """
+    time = log.odometry_time
+    period = int(np.median(np.diff(time))) if len(time) > 1 else 0
+    edges = np.append(time, time[-1] + period)
+    return edges, np.vstack([[0.0, 0.0], log.odometry, [0.0, 0.0]])
 
 
 def _commands(log):

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from jaxslam.logs.log import FloorPlan, Log, Truth
+from jaxslam.logs.truth import wrap
 
 ROOM = (10.0, 4.0)  # m, lower-left corner at the origin
 MARGIN, CORNER = 1.0, 0.8  # m between path and walls, and the radius of the path's corners
@@ -223,7 +224,7 @@ def _stop_and_go(rng, loop, given, mean, start):
         dx, dy = path[i + 1] - (x, y)
         distance = max(0.0, cos(heading) * dx + sin(heading) * dy)
         dx, dy = path[i + 2] - (x + cos(heading) * distance, y + sin(heading) * distance)
-        turn = _wrap(atan2(dy, dx) - heading)
+        turn = wrap(atan2(dy, dx) - heading)
         commands.append((distance, turn))
         piece = distance, 0.0, turn, distance, duration, 0.0, 0.0
         poses.append(_move(poses[-1], *piece, given, rng.standard_normal(3)))
@@ -236,10 +237,10 @@ def _follow(pose, path, period):
     x, y, heading = pose
     (ax, ay), (bx, by), (cx, cy) = path
     speed, direction = hypot(bx - ax, by - ay) / period, atan2(by - ay, bx - ax)
-    rate = _wrap(atan2(cy - by, cx - bx) - direction) / period
+    rate = wrap(atan2(cy - by, cx - bx) - direction) / period
     ahead = cos(heading) * (ax - x) + sin(heading) * (ay - y)
     left = cos(heading) * (ay - y) - sin(heading) * (ax - x)
-    off = _wrap(direction - heading)
+    off = wrap(direction - heading)
     v = min(max(speed * cos(off) + ahead, 0.0), 2 * speed)
     return v, rate + speed * (4 * left + 3 * sin(off))
 
@@ -265,7 +266,7 @@ def _move(pose, length, chord, turn, distance, duration, lever, lever_var, given
     across = slope * error + sqrt(max(across_var - slope * both, 0.0)) * draw[2]
     x += cos(chord) * along - sin(chord) * across
     y += sin(chord) * along + cos(chord) * across
-    return x, y, _wrap(heading + given.gain_rot * turn + bias + error)
+    return x, y, wrap(heading + given.gain_rot * turn + bias + error)
 
 
 def _look(rng, pose, marks, given):
@@ -275,12 +276,12 @@ def _look(rng, pose, marks, given):
     low, high, reach = given.view
     dx = marks[:, 0] - (x + mx * cos(heading) - my * sin(heading))
     dy = marks[:, 1] - (y + mx * sin(heading) + my * cos(heading))
-    r, b = np.hypot(dx, dy), _wrap(np.arctan2(dy, dx) - heading - yaw)
+    r, b = np.hypot(dx, dy), wrap(np.arctan2(dy, dx) - heading - yaw)
     inside = (low <= b) & (b <= high)
     found = inside & (rng.random(len(r)) < given.detection * np.maximum(0, 1 - r / reach))
     identity = np.flatnonzero(found)
     r, b = r[identity], b[identity]
-    b = _wrap(
+    b = wrap(
         b + np.hypot(given.sigma_bearing, given.landmark_extent / r) * rng.standard_normal(len(b))
     )
     r = r + given.sigma_range * rng.standard_normal(len(r))
@@ -295,10 +296,6 @@ def _look(rng, pose, marks, given):
 
 def _stamps(count, rate):
     return np.rint(count * (1e9 / rate)).astype(np.int64)
-
-
-def _wrap(angle):
-    return angle - 2 * pi * np.floor((angle + pi) / (2 * pi))
 
 
 def _check(given):
