@@ -138,11 +138,12 @@ def test_options_of_simulate_are_those_of_the_library(at, call, monkeypatch):
     renamed = {"length": "length_m", "rate": "rate_hz", "odometry_rate": "odometry_hz"}
     renamed |= {"stop": "stop_m"}
     options = inspect.signature(cli.planar).parameters.values()
-    library = inspect.signature(simulate.planar).parameters
+    library = inspect.signature(simulate.planar).parameters.values()
+    library = {o.name: o.default for o in library} | simulate.NOISE
     defaults = {renamed.get(o.name, o.name): o.default for o in options}
-    assert defaults.pop("view_range") == library["view"].default[2]
+    assert defaults.pop("view_range") == library["view"][2]
     del defaults["out"], defaults["overwrite"]
-    assert defaults == {name: library[name].default for name in defaults}
+    assert defaults == {name: library[name] for name in defaults}
 
     seen, planar = {}, simulate.planar
 
