@@ -32,6 +32,7 @@ from jaxslam.cli.common import (
 )
 from jaxslam.config import ASSOCIATIONS, PROPOSALS
 from jaxslam.files import NO_SPACE
+from jaxslam.logs.readers import FORMATS
 from jaxslam.runs import cluster, supervisor
 
 HELP = f"""FastSLAM: from a logged run to map, trajectory and figures.
@@ -202,21 +203,22 @@ def compare(
     return int(bool(parted))
 
 
-@app.command(usage="Usage: jaxslam convert [OPTIONS] SRC... OUT.npz")
+CONVERT = f"""Convert files in another format to a log; the format is detected.
+
+SRC may be:
+{chr(10).join(f"- {row.name}: {row.help}" for row in FORMATS)}
+
+Example: jaxslam convert odometry.csv measurements.csv OUT.npz"""
+
+
+@app.command(help=CONVERT, usage="Usage: jaxslam convert [OPTIONS] SRC... OUT.npz")
 def convert(
     *paths: option(Path, "files or folder to read, then the log to write"),
     robot: at_least("which robot of an MRCLAM folder") | None = None,
     time_offset: option(float, "seconds to move the frames by, as check says") = 0.0,
     overwrite: Overwrite = False,
 ):
-    """Make a log of other people's files; their format is guessed.
-
-    The course's dataset2.mat, an MRCLAM folder (with --robot), or two to four
-    .csv files: odometry, measurements, and true poses and landmarks if known;
-    or a log, to move its frames (--time-offset).
-
-    Example: jaxslam convert odometry.csv measurements.csv OUT.npz
-    """
+    """Convert files in one of `readers.FORMATS` to a log."""
     from jaxslam.logs.clock_offset import shift_frames
     from jaxslam.logs.log import NOT_USED
     from jaxslam.logs.log_file import save_log

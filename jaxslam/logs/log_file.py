@@ -59,10 +59,10 @@ def load_log(path):
         with resources.as_file(source) as file:
             return load_log(file)
     path = Path(path)
-    if path.is_dir() or path.suffix.lower() in (".mat", ".csv", ".dat"):
-        raise ValueError(f"{path}: is no log; make one of it with: jaxslam convert {path} OUT.npz")
-    if not path.is_file():
+    if not path.exists():
         raise ValueError(f"{path}: no such file (bundled logs: {', '.join(BUNDLED)})")
+    if path.suffix.lower() != ".npz" and not (path.is_file() and zipfile.is_zipfile(path)):
+        raise ValueError(f"{path}: is no log; make one of it with: jaxslam convert {path} OUT.npz")
     try:
         return _build(_read_entries(path))
     except Exception as err:  # foreign bytes: zipfile, zlib and NumPy raise whatever they like
