@@ -1,4 +1,4 @@
-"""A part of a log, as a log of its own."""
+"""Parts of a log, as logs: a time interval, windows, or fewer frames."""
 
 import dataclasses
 
@@ -13,20 +13,20 @@ S = 10**9  # ns
 
 
 def cut(log, start=0.0, end=None):
-    """The `Log` between two times [s after `log.start`]: frames in (start, end], at `start` 0 also
-    the one there is; `end` None: all that follows.
+    """Cut a log to the frames in (start, end], times in s after `log.start`.
 
-    A velocity that was held at `start` is held from there on; of commands those belong to the cut
-    that end within it. It begins at `start`, in the log's `start_pose` if that is 0; else in the
-    true pose, or the origin if nobody knows it, and exactly. `skipped` stays that of the whole log.
+    `start` 0 includes a frame at 0; `end` None: the log's end. The cut holds the velocity that was
+    held at `start`, or the commands that end within it. It starts in the log's `start_pose` if
+    `start` is 0, else exactly in the true pose, or the origin without truth. `skipped` stays that
+    of the log.
 
-    Raises `ValueError` for times that hold no frame.
+    Raises `ValueError` if no frame lies between.
     """
     length = _length(log)
     last = length if end is None else end
     if not (np.isfinite(start) and np.isfinite(last) and 0 <= start < last):
         raise ValueError(f"cut from {start} to {last} s; must be 0 or more, and the end later")
-    # A frame at the very end must not be lost to rounding.
+    # Rounding must not lose a frame at the very end.
     begin, stop = (log.start + round(t * S) for t in (start, min(last, length)))
     frames = (log.frame_time > begin - (begin == log.start)) & (log.frame_time <= stop)
     if not frames.any():
@@ -49,9 +49,9 @@ def cut(log, start=0.0, end=None):
 
 
 def windows(log, seconds):
-    """The log in pieces of so many seconds, a list of `Log`s; what is left is a piece if it is half
-    as long at least. Pieces without frames are left out.
+    """Cut a log into a list of `Log`s of `seconds` each.
 
+    The rest is a window if it is at least half as long. Windows without frames are left out.
     Raises `ValueError` for a length that is not above 0.
     """
     if not (np.isfinite(seconds) and seconds > 0):
@@ -66,10 +66,10 @@ def windows(log, seconds):
 
 
 def spaced(log, seconds):
-    """The log with only frames that are `seconds` apart or more (0: all); odometry stays whole.
+    """Keep only frames that are at least `seconds` apart (0: all), and all odometry.
 
-    Errors of frames in quick succession are alike, which a filter, and more so learning, takes for
-    precision. What is left out is not counted as `skipped`.
+    Errors of frames in quick succession are correlated, which a filter, and more so learning, takes
+    for precision. Frames left out are not counted in `skipped`.
     """
     if not (np.isfinite(seconds) and seconds >= 0):
         raise ValueError(f"frames {seconds} s apart; must be 0 or more")
@@ -114,7 +114,7 @@ def _velocities(log, begin, stop):
 
 
 def _commands(log, begin, stop):
-    """Commands that end between two stamps, after one of nothing that marks the beginning."""
+    """Commands that end between two stamps, after an empty one that marks the start."""
     time = log.odometry_time
     inside = (time > begin - (begin == log.start)) & (time <= stop)
     if inside.any() and time[inside][0] == begin:
@@ -123,10 +123,10 @@ def _commands(log, begin, stop):
 
 
 def _true_pose(log, stamp):
-    """The true pose at a stamp [3], of the nearest where truth ends; the origin without truth."""
+    """True pose [3] at a stamp, beyond the truth's ends the nearest; the origin without truth."""
     if log.truth is None or log.truth.time is None or not len(log.truth.time):
         return np.zeros(3)
-    if log.odometry_kind == "command":  # the first command in the cut begins where one ended
+    if log.odometry_kind == "command":  # the first command of the cut begins where the last ended
         stamp = max(log.odometry_time[log.odometry_time <= stamp], default=log.start)
     return truth_at(log.truth, np.array([stamp]), gap=np.inf, snap=np.inf)[0]
 
