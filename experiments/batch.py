@@ -24,7 +24,7 @@ import numpy as np
 from calibration.odometry import fit_odometry
 from jaxslam import config_for, default_params, load_log, load_params
 from jaxslam.filter.frames import frames_from_log
-from jaxslam.logs.readers import read_mrclam
+from jaxslam.logs.readers.mrclam import read_mrclam
 from jaxslam.logs.truth import truth_at, wrap
 from jaxslam.models import sensors
 from jaxslam.models.motion import model

@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from jaxslam.config import SENSORS
+
 DEMO = "lost-in-the-woods"
 
 
@@ -23,7 +25,7 @@ def at_least(text, least=1, most=10**9):
 Seed = at_least("of the random draws: the same seed, the same run", 0, 2**32 - 1)
 LogName = option(str, f"a .npz file, or {DEMO}")
 Overwrite = option(bool, "replace what is there")
-Sensors = Literal["range_bearing", "position", "bearing"]
+Sensors = Literal[SENSORS]
 Sensor = option(Sensors, "what is used (the first that the log has)") | None
 Start = option(float, "use the log from here on [s after its start]")
 End = option(float, "use the log up to here [s after its start] (all)") | None

@@ -32,6 +32,7 @@ from jaxslam.cli.common import (
 )
 from jaxslam.config import ASSOCIATIONS, PROPOSALS
 from jaxslam.files import NO_SPACE
+from jaxslam.logs.readers import FORMATS
 from jaxslam.runs import cluster, supervisor
 
 HELP = f"""FastSLAM: from a logged run to map, trajectory and figures.
@@ -173,7 +174,6 @@ def compare(
     params: ParamFile = None,
     paper: Paper = False,
     particles: option(str, "particle counts of the baseline, by commas") = "20,100",
-    variants: at_least("particles of the second table's filters (0: no table)", 0) = 1000,
     steps: at_least("frames to filter") = 200,
     every: at_least("use each n-th frame (the steps cover a tenth)") | None = None,
     seed: Seed = 0,
@@ -181,8 +181,7 @@ def compare(
     """Show the filter beside the plain NumPy baseline: agreement, accuracy, time.
 
     Both get the same random draws. The baseline is slow: 20 particles over 200
-    steps take it some 10 seconds. A second table adds the paper's rules, FastSLAM
-    1.0, the informed proposal and refinement, with more particles.
+    steps take it some 10 seconds.
 
     Example: jaxslam compare lost-in-the-woods --particles 20,100 --steps 200
     """
@@ -198,34 +197,28 @@ def compare(
         with bar(f"{count} particles", compiles=True) as progress:
             rows.append(sides.compare(loaded, *model, seed, steps, every, progress))
     print(sides.table(rows))
-    if variants:
-        from jaxslam.reference import variants as rules
-
-        with bar("variants", compiles=True) as progress:
-            model = cli_run.build_model(loaded, sensor, association, variants, None, params, paper)
-            found = rules.variants(loaded, *model, seed, steps, every, rows, progress)
-        print(f"\n{rules.table(found)}")
     parted = [row.double for row in rows if row.double.same < row.double.steps]
     for row in parted:
         warn(f"{row.particles} particles: the two part at step {row.same}")
     return int(bool(parted))
 
 
-@app.command(usage="Usage: jaxslam convert [OPTIONS] SRC... OUT.npz")
+CONVERT = f"""Convert files in another format to a log; the format is detected.
+
+SRC may be:
+{chr(10).join(f"- {row.name}: {row.help}" for row in FORMATS)}
+
+Example: jaxslam convert odometry.csv measurements.csv OUT.npz"""
+
+
+@app.command(help=CONVERT, usage="Usage: jaxslam convert [OPTIONS] SRC... OUT.npz")
 def convert(
     *paths: option(Path, "files or folder to read, then the log to write"),
     robot: at_least("which robot of an MRCLAM folder") | None = None,
     time_offset: option(float, "seconds to move the frames by, as check says") = 0.0,
     overwrite: Overwrite = False,
 ):
-    """Make a log of other people's files; their format is guessed.
-
-    The course's dataset2.mat, an MRCLAM folder (with --robot), or two to four
-    .csv files: odometry, measurements, and true poses and landmarks if known;
-    or a log, to move its frames (--time-offset).
-
-    Example: jaxslam convert odometry.csv measurements.csv OUT.npz
-    """
+    """Convert files in one of `readers.FORMATS` to a log."""
     from jaxslam.logs.clock_offset import shift_frames
     from jaxslam.logs.log import NOT_USED
     from jaxslam.logs.log_file import save_log

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.logs.appearance_space import fit_appearance_space
+from jaxslam.config import SENSORS
 from jaxslam.logs.odometry import Odometry, increments
 from jaxslam.models.sensors import Measurements
 from jaxslam.parameters import default_params
@@ -33,7 +33,7 @@ def frames_from_log(log, config, params=None):
     """
     sensor, known = config.sensor, config.association == "known"
     if not log.has(sensor):
-        has = [name for name in ("position", "range_bearing", "bearing") if log.has(name)]
+        has = [name for name in SENSORS if log.has(name)]
         raise ValueError(
             f"{log.name}: sensor {sensor!r} is not in this log; it has {' '.join(has)}"
         )
@@ -89,7 +89,7 @@ def _appearance_columns(log, size, row):
     """`Measurements.descriptor` [T, K, J] and `within` [T, J] of the slots' rows."""
     if not size:
         return {}
-    found = fit_appearance_space(log)
+    found = log.appearance_space
     if len(found.within) < size:
         raise ValueError(
             f"{log.name}: {size} descriptors are asked for, but {len(found.within)} tell landmarks "

@@ -8,11 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.config import Config
+from jaxslam.config import SENSORS, Config
 from jaxslam.filter import sharding
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.frames import frames_from_log
-from jaxslam.logs.appearance_space import fit_appearance_space
 from jaxslam.parameter_file import validate
 from jaxslam.parameters import default_params
 from jaxslam.results.events import association_entropy
@@ -42,14 +41,14 @@ def config_for(log, sensor=None, association="maximum_likelihood", **settings):
     them as far as the log's descriptors tell landmarks apart.
     """
     if sensor is None:
-        sensor = next(s for s in ("range_bearing", "position", "bearing") if log.has(s))
+        sensor = next(s for s in SENSORS if log.has(s))
     settings.setdefault("measurements", max(1, int(np.bincount(log.frame, minlength=1).max())))
     if association == "known" and log.identity is not None:
         settings.setdefault("landmarks", max(1, len(np.unique(log.identity[log.identity >= 0]))))
     if sensor == "bearing" and association == "maximum_likelihood":
         settings.setdefault("proposal", "informed")
     if sensor == "bearing" and association != "known" and "descriptors" not in settings:
-        settings["descriptors"] = len(fit_appearance_space(log).within)
+        settings["descriptors"] = len(log.appearance_space.within)
     return Config(sensor=sensor, association=association, **settings)
 
 

@@ -126,7 +126,7 @@ def test_hidden_bearings_alone_get_looks_unless_told_otherwise(room):
     assert run.config_for(planar(length_m=3.0)).descriptors == 0
     with pytest.raises(ValueError, match="3 descriptors are asked for, but 2 tell landmarks"):
         frames_from_log(room, run.config_for(room, "bearing", descriptors=3))
-    with pytest.raises(ValueError, match="identities are known, so looks decide nothing"):
+    with pytest.raises(ValueError, match="identities are known, so appearance decides nothing"):
         Config(association="known", descriptors=1)
     with pytest.raises(ValueError, match=r"Config\.descriptors: -1 is not a whole number"):
         Config(descriptors=-1)
