@@ -48,15 +48,15 @@ def find_edges(panorama_image, valid, contrast, significance, length, gap, slope
     gradient = gradient.reshape(*padded.shape[:2], -1)
     along = along.reshape(gradient.shape)
     magnitude = np.sqrt(np.einsum("hwc,hwc->hw", along, along))
-    magnitude[~_seen(valid)] = 0
+    magnitude[~_erode_mask(valid)] = 0
     noise = _noise(magnitude)
     threshold = np.maximum(contrast, significance * noise)
     peak = _peaks(magnitude, threshold[:, None].astype(np.float32))
     row, column, segment = _segments(peak, length, gap, slope)
-    return Edges(segment, row, _refined(magnitude, row, column), gradient, along)
+    return Edges(segment, row, _interpolate_columns(magnitude, row, column), gradient, along)
 
 
-def _seen(valid):
+def _erode_mask(valid):
     """The padded mask, less what the filters mix with the border of the image."""
     padded = np.concatenate([valid[:, -PAD:], valid, valid[:, :PAD]], axis=1).astype(np.uint8)
     if padded.all():
@@ -102,7 +102,7 @@ def _segments(peak, length, gap, slope):
     return row[order], column[order], np.unique(label[order], return_inverse=True)[1]
 
 
-def _refined(magnitude, row, column):
+def _interpolate_columns(magnitude, row, column):
     """Columns to a fraction, by the parabola through a peak and its neighbours."""
     left, middle, right = (magnitude[row, column + k] for k in (-1, 0, 1))
     return column + (right - left) / (2 * (2 * middle - left - right)).clip(1e-6)

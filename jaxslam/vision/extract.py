@@ -15,7 +15,7 @@ from jaxslam.logs.log_file import save_log
 from jaxslam.logs.odometry import increments
 from jaxslam.logs.readers.csv_files import read_odometry, read_truth
 from jaxslam.logs.readers.text_table import drop_bad_rows, parse, pose_at, read_lines
-from jaxslam.vision.extraction_journal import Partial
+from jaxslam.vision.extraction_journal import ExtractionJournal
 from jaxslam.vision.image_times import NO_TIME, image_times
 from jaxslam.vision.images import Images, cv2
 from jaxslam.vision.lines import Lines, LineSettings, extract_lines, is_dark
@@ -66,18 +66,22 @@ def extract(
     _check_overlay(overlay, images, overwrite or (partial is not None and partial.exists()))
     kind, table = read_odometry(odometry, skipped)
     time, origin = image_times(images, (kind, table.time), times)
-    kept = _in_time(images, time, kind, table.time, skipped)
+    kept = _select_images(images, time, kind, table.time, skipped)
     if len(kept) == 0:
-        between = f"{origin}, {_span(time[time != NO_TIME])}; {odometry} has {_span(table.time)}"
-        raise ValueError(f"{images.names[0]}: no image has odometry; times are from {between}")
-    known = _read_known(truth, skipped)
-    settings = _settings(images, time, kept, camera, lines)
-    with Partial(partial, settings) as done:
-        _look(images, kept, camera, lines, done, overlay, progress)
+        spans = f"{_format_span(time[time != NO_TIME])}; {odometry} has {_format_span(table.time)}"
+        raise ValueError(
+            f"{images.names[0]}: no image has odometry; times are from {origin}, {spans}"
+        )
+    known = _read_truth_folder(truth, skipped)
+    settings = _fingerprint(images, time, kept, camera, lines)
+    with ExtractionJournal(partial, settings) as done:
+        _extract_images(images, kept, camera, lines, done, overlay, progress)
     if all(isinstance(found, str) for _, found in done.rows):
         done.remove()  # nothing in it is worth going on from
-    log = _log(done.rows, time[kept], kind, table, camera, reach, skipped, _name(source, out))
-    log = _with_truth(log, *known)
+    log = _make_log(
+        done.rows, time[kept], kind, table, camera, reach, skipped, _log_name(source, out)
+    )
+    log = _add_truth(log, *known)
     if params is not None:  # the filter must believe of the motion what the points were made with
         noise = {name: float(getattr(params, name)) for name in MOTION}
         log = replace(log, noise=log.noise | noise)
@@ -112,18 +116,18 @@ def _check_overlay(target, images, replace):
         raise ValueError(f"{target}: exists; choose another name or add --overwrite")
 
 
-def _span(stamps):
+def _format_span(stamps):
     return f"{stamps.min() / 1e9:.1f} to {stamps.max() / 1e9:.1f} s"
 
 
-def _name(source, out):
+def _log_name(source, out):
     if out is not None:
         return Path(out).stem
     first = source[0] if isinstance(source, list | tuple) else source
     return Path(first).stem or "images"
 
 
-def _in_time(images, time, kind, odometry_time, skipped):
+def _select_images(images, time, kind, odometry_time, skipped):
     """Indices of the images to look at, in order of time."""
     timed = np.flatnonzero(time != NO_TIME)
     _count(skipped, "image without a time", len(time) - len(timed))
@@ -155,7 +159,7 @@ def _count(skipped, reason, count):
         skipped[reason] = skipped.get(reason, 0) + int(count)
 
 
-def _settings(images, time, kept, camera, lines):
+def _fingerprint(images, time, kept, camera, lines):
     """What the lines depend on, for a run that goes on later."""
     names = [images.names[i] for i in kept]
     files = [images.video] if images.video else [images.files[i] for i in kept]
@@ -170,7 +174,7 @@ def _settings(images, time, kept, camera, lines):
     }
 
 
-def _look(images, kept, camera, settings, done, overlay, progress):
+def _extract_images(images, kept, camera, settings, done, overlay, progress):
     """Lines of all images that are not done yet, appended to `done`, and drawn if wanted."""
     total, ready = len(kept), len(done.rows)
     with _Overlay(overlay) as canvas:
@@ -178,7 +182,7 @@ def _look(images, kept, camera, settings, done, overlay, progress):
         first = 0 if overlay is not None else ready
         for k, (name, image) in enumerate(_stream(images, kept, first), first):
             if k >= ready:
-                done.add(name, _lines_of(image, camera, settings))
+                done.add(name, _extract_image(image, camera, settings))
             if overlay is not None and not isinstance(done.rows[k][1], str):
                 canvas.add(name, draw_on_image(image, done.rows[k][1], camera))
             if progress:
@@ -199,7 +203,7 @@ def _stream(images, kept, first):
         yield images.names[i], ValueError(f"{images.names[i]}: the video ends before")
 
 
-def _lines_of(image, camera, settings):
+def _extract_image(image, camera, settings):
     """`Lines`, or the reason why there are none."""
     if isinstance(image, ValueError):
         return f"image unreadable: {str(image).split(': ', 1)[-1]}"
@@ -211,7 +215,7 @@ def _lines_of(image, camera, settings):
     return extract_lines(image, camera, settings)
 
 
-def _log(rows, time, kind, odometry, camera, reach, skipped, name):
+def _make_log(rows, time, kind, odometry, camera, reach, skipped, name):
     """The `Log` of bearings alone."""
     reasons = Counter(found for _, found in rows if isinstance(found, str))
     first = {}
@@ -246,7 +250,7 @@ def _log(rows, time, kind, odometry, camera, reach, skipped, name):
     return log
 
 
-def _read_known(folder, skipped):
+def _read_truth_folder(folder, skipped):
     """`Truth` and `FloorPlan` in a folder, None where it has none; counts bad rows in `skipped`."""
     if folder is None:
         return None, None
@@ -259,7 +263,7 @@ def _read_known(folder, skipped):
     return truth, plan
 
 
-def _with_truth(log, truth, plan):
+def _add_truth(log, truth, plan):
     """The log with what is known of the truth, and the start pose of it."""
     motion = increments(log)
     still = (motion.distance[1:] == 0) & (motion.turn[1:] == 0)

@@ -17,7 +17,7 @@ from jaxslam.vision.lines import Lines
 EVERY_S = 1.0  # s between forced writes: that much work is lost at most
 
 
-class Partial:
+class ExtractionJournal:
     """Images done, in order: `rows`, each (name, `Lines` or the reason why there are none).
 
     `settings`: what the result depends on, as JSON can write it. Use it in a `with`; `path` None
@@ -56,7 +56,7 @@ class Partial:
             return 0
         try:
             settings = json.loads(lines[0])
-            rows = [_decoded(json.loads(line)) for line in lines[1:]]
+            rows = [_decode(json.loads(line)) for line in lines[1:]]
         except (ValueError, KeyError, TypeError) as err:
             raise ValueError(f"{self.path}: is damaged ({err}); delete it to begin anew") from None
         if settings != self.settings:
@@ -73,7 +73,7 @@ class Partial:
         """Append an image's `Lines`, or the reason why there are none."""
         self.rows.append((name, found))
         if self.file is not None:
-            self._append(_encoded(name, found))
+            self._append(_encode(name, found))
             if time.monotonic() - self.forced > EVERY_S:
                 self._force()
 
@@ -91,7 +91,7 @@ class Partial:
         self.forced = time.monotonic()
 
 
-def _encoded(name, found):
+def _encode(name, found):
     if isinstance(found, str):
         return {"image": name, "skipped": found}
     parts = {}
@@ -102,7 +102,7 @@ def _encoded(name, found):
     return {"image": name, "lines": parts}
 
 
-def _decoded(row):
+def _decode(row):
     if "skipped" in row:
         return row["image"], row["skipped"]
     arrays = {}

@@ -42,7 +42,7 @@ def from_ocamcalib(text):
     direct = values[0][1:]
     if len(direct) > 7 or direct[1:2].any():
         raise ValueError("direct polynomial: must be of order 6 at most, without a linear term")
-    width, height = _whole("image size", width), _whole("image size", height)
+    width, height = _positive_integer("image size", width), _positive_integer("image size", height)
     powers = np.arange(max(len(direct), 3))
     a = -np.pad(direct, (0, len(powers) - len(direct))) * (max(width, height) / 2) ** (powers - 1.0)
     params = [column, row, c, d, e, 0, 0, a[0], *a[2:]]
@@ -69,7 +69,8 @@ def to_ocamcalib(camera):
         [camera.height, camera.width],
     )
     lines = [
-        f"#{title}\n\n{_written(values)}\n" for title, values in zip(OCAM, numbers, strict=True)
+        f"#{title}\n\n{_format_numbers(values)}\n"
+        for title, values in zip(OCAM, numbers, strict=True)
     ]
     return "\n".join(lines)
 
@@ -87,7 +88,7 @@ def _inverse(direct, farthest):
     return fit.convert().coef
 
 
-def _written(values):
+def _format_numbers(values):
     return " ".join(str(v) if isinstance(v, int) else f"{v:.16e}" for v in values)
 
 
@@ -110,7 +111,7 @@ def from_kalibr(text):
             raise ValueError(f"cam0.{name} is {values!r}; must be {count} numbers")
         found.append(_floats(f"cam0.{name}", values))
     (xi, fx, fy, cx, cy), distortion, size = found
-    width, height = (_whole("cam0.resolution", n) for n in size)
+    width, height = (_positive_integer("cam0.resolution", n) for n in size)
     params = [cx, cy, fx, fy, 0, xi, *distortion]
     return dict(width=width, height=height, model="unified", params=params)
 
@@ -156,7 +157,9 @@ def from_opencv(text):
     fx, s, cx, _, fy, cy = found["camera_matrix"][:6]
     if not np.array_equal(found["camera_matrix"][[3, 6, 7, 8]], [0, 0, 0, 1]):
         raise ValueError("camera_matrix must be [fx, s, cx; 0, fy, cy; 0, 0, 1]")
-    width, height = (_whole(name, found[name][0]) for name in ("image_width", "image_height"))
+    width, height = (
+        _positive_integer(name, found[name][0]) for name in ("image_width", "image_height")
+    )
     params = [cx, cy, fx, fy, s, found["xi"][0], *found["distortion_coefficients"]]
     return dict(width=width, height=height, model="unified", params=params)
 
@@ -185,7 +188,7 @@ def _floats(name, values):
     return numbers
 
 
-def _whole(name, value):
+def _positive_integer(name, value):
     if value != int(value) or value < 1:
         raise ValueError(f"{name} is {value:g}; must be a whole number above 0")
     return int(value)

@@ -19,7 +19,7 @@ def image_times(images, odometry, table=None):
     after each; a video's own times; names that are plain numbers, in seconds. `odometry` is (kind,
     stamps [o] ns). Raises `ValueError` that says what to provide.
     """
-    table = _beside(images) if table is None else Path(table)
+    table = _find_table(images) if table is None else Path(table)
     if table is not None:
         return _from_table(images, table), str(table)
     kind, stamps = odometry
@@ -28,7 +28,9 @@ def image_times(images, odometry, table=None):
         return np.append(stamps[0] - 10**9, stamps), "one image before and after each command"
     if images.video:
         frame = np.arange(len(images))
-        return np.rint(frame * (1e9 / _rate(images.video))).astype(np.int64), "the video's rate"
+        return np.rint(frame * (1e9 / _frame_rate(images.video))).astype(
+            np.int64
+        ), "the video's rate"
     try:
         return np.array([stamp(Path(name).stem) for name in images.names]), "the images' names"
     except ValueError:
@@ -40,7 +42,7 @@ def image_times(images, odometry, table=None):
     )
 
 
-def _rate(path):
+def _frame_rate(path):
     """Frames per second of a video."""
     video = cv2.VideoCapture(str(path))
     try:
@@ -52,7 +54,7 @@ def _rate(path):
     return rate
 
 
-def _beside(images):
+def _find_table(images):
     """The `frames.csv` of the images' folder, or of the folder above it."""
     folder = images.video.parent if images.video else Path(images.files[0]).parent
     places = [folder / "frames.csv", folder.parent / "frames.csv"]

@@ -31,7 +31,7 @@ def read_image(path):
     A rotation told by the file is not applied: a calibration belongs to the pixels as recorded.
     Raises `ValueError` naming the file and what is wrong with it.
     """
-    data = _bytes(path)
+    data = _read_bytes(path)
     header = read_header(path, data)
     if header.bits > 8:
         raise ValueError(f"{path}: {header.bits} bits per channel; {REMEDY_16}")
@@ -52,7 +52,7 @@ def read_image(path):
 
 def image_header(path):
     """`Header` of an image file, without decoding it. Raises `ValueError`."""
-    return read_header(path, _bytes(path))
+    return read_header(path, _read_bytes(path))
 
 
 def check_size(image, camera, name):
@@ -91,12 +91,12 @@ class Images:
     def _find(self, path):
         if path.is_dir():
             inside = [file for file in path.iterdir() if not file.name.startswith(".")]
-            return _natural(file for file in inside if file.suffix.lower() in IMAGE_SUFFIXES)
+            return _sort_naturally(file for file in inside if file.suffix.lower() in IMAGE_SUFFIXES)
         if path.is_file():
             self.video = path if path.suffix.lower() in VIDEO_SUFFIXES else None
             return [path]
         if glob.has_magic(str(path)):
-            return _natural(Path(file) for file in glob.glob(str(path)))
+            return _sort_naturally(Path(file) for file in glob.glob(str(path)))
         raise ValueError(f"{path}: no such file or folder")
 
     def __len__(self):
@@ -117,7 +117,7 @@ class Images:
                 yield name, error
 
 
-def _natural(files):
+def _sort_naturally(files):
     """Paths sorted as people count: 2 before 10."""
 
     def key(file):
@@ -157,7 +157,7 @@ def _video_frames(path, names, first):
         video.release()
 
 
-def _bytes(path):
+def _read_bytes(path):
     path = Path(path)
     if not path.is_file():
         fault = "is a folder, not an image" if path.is_dir() else "no such file"

@@ -9,11 +9,11 @@ from math import pi
 
 import numpy as np
 
-APART = np.linspace(1.1, 7, 119)  # true distances, in widths: nearer edges cancel each other
+SEPARATION = np.linspace(1.1, 7, 119)  # true distances, in widths: nearer edges cancel each other
 WIDER = 1.15  # the gradient of a sharp edge over its width at the peak
 
 
-def merged(lines, bearing, gap):
+def merge_pieces(lines, bearing, gap):
     """`Lines` with pieces of one line put together: close in `bearing`, at most `gap` apart [rad].
 
     Pieces of one line lie above each other, and colour changes across them in the same sense.
@@ -22,7 +22,7 @@ def merged(lines, bearing, gap):
     if n < 2:
         return lines
     between = np.maximum(lines.low[:, None] - lines.high, lines.low - lines.high[:, None])
-    same = (np.abs(_turn(lines)) <= bearing) & (between <= gap)
+    same = (np.abs(_bearing_difference(lines)) <= bearing) & (between <= gap)
     # not by polarity, which is a toss-up where two colours are equally bright
     step = (lines.colour[:, 0] - lines.colour[:, 1]).astype(float)
     same &= (step @ step.T > 0) | np.eye(n, dtype=bool)
@@ -32,17 +32,17 @@ def merged(lines, bearing, gap):
         if (least == group).all():
             break
         group = least
-    return _combined(lines, np.unique(group, return_inverse=True)[1])
+    return _combine(lines, np.unique(group, return_inverse=True)[1])
 
 
-def separated(lines, width):
+def separate_close_pairs(lines, width):
     """`Lines` with close pairs of opposite polarity moved together, and less sure of themselves.
 
     `width` [rad]: standard deviation of a sharp edge's gradient in this image.
     """
     if len(lines.bearing) < 2:
         return lines
-    apart = _turn(lines)
+    apart = _bearing_difference(lines)
     overlap = np.minimum(lines.high[:, None], lines.high) - np.maximum(
         lines.low[:, None], lines.low
     )
@@ -52,8 +52,8 @@ def separated(lines, width):
     share = square / (square[:, None] + square)  # the weaker one is pushed farther
     width = WIDER * width
     seen = np.abs(apart) / width
-    true = np.interp(seen, LOOKS, APART, left=APART[0])
-    too_far = np.where(pair & (seen < APART[-1]), (seen - true) * width, 0.0)
+    true = np.interp(seen, APPARENT, SEPARATION, left=SEPARATION[0])
+    too_far = np.where(pair & (seen < SEPARATION[-1]), (seen - true) * width, 0.0)
     push = too_far * share * part * np.sign(apart)
     bearing = lines.bearing - push.sum(axis=1)
     return lines._replace(
@@ -62,22 +62,22 @@ def separated(lines, width):
     )
 
 
-def _looks_apart():
+def _apparent_separation():
     """How far apart two opposite edges look: their gradients are a Gaussian less another beside."""
-    x, d = np.linspace(0, 8, 801), APART[:, None]
+    x, d = np.linspace(0, 8, 801), SEPARATION[:, None]
     both = np.exp(-0.5 * (x - d / 2) ** 2) - np.exp(-0.5 * (x + d / 2) ** 2)
     return 2 * x[np.argmax(both, axis=1)]
 
 
-LOOKS = _looks_apart()
+APPARENT = _apparent_separation()
 
 
-def _turn(lines):
+def _bearing_difference(lines):
     """Bearing of each line from each [n, n] rad in [-pi, pi): positive where it is to the left."""
     return (lines.bearing[:, None] - lines.bearing + pi) % (2 * pi) - pi
 
 
-def _combined(lines, group):
+def _combine(lines, group):
     n = group.max() + 1
     first = np.unique(group, return_index=True)[1]
     weight = 1 / lines.sigma**2

@@ -15,7 +15,7 @@ import numpy as np
 from jaxslam.vision.edge_localisation import fit_segments, mean
 from jaxslam.vision.edges import PAD, find_edges
 from jaxslam.vision.images import check_size
-from jaxslam.vision.line_merging import merged, separated
+from jaxslam.vision.line_merging import merge_pieces, separate_close_pairs
 from jaxslam.vision.panorama import panorama, unwrap
 
 BESIDE = (2, 3, 4)  # columns away from the edge whose mean is the colour beside it
@@ -96,7 +96,7 @@ def extract_lines(image, camera, settings=None):
     edges, level = _edges(picture, view, settings)
     lines = _lines(edges, picture, view, settings, level)
     if settings.merge:
-        lines = merged(lines, settings.merge_bearing, settings.merge_gap)
+        lines = merge_pieces(lines, settings.merge_bearing, settings.merge_gap)
     return lines.take(np.argsort(lines.bearing, kind="stable"))
 
 
@@ -167,7 +167,7 @@ def _lines(edges, picture, view, settings, level):
         colour=_colours(edges, picture, fit)[index],
         strength=fit.strength[index] / level,
     )
-    return separated(lines, usual * view.step)
+    return separate_close_pairs(lines, usual * view.step)
 
 
 def _upright(fit, view, settings, level):

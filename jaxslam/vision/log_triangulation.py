@@ -20,13 +20,13 @@ from jaxslam.vision.triangulation import (
     STILL,
     TriangulationSettings,
     compose,
-    of_sensor,
+    sensor_motion,
     triangulate,
 )
 
 PAIRS = ("disjoint", "consecutive", "overlapping")
 NEW, SHORT, MISFIT = range(len(REASONS), len(REASONS) + 3)
-WHY = (
+OUTCOMES = (
     *REASONS,
     "first seen here",
     "driven less than the baseline since first seen",
@@ -122,8 +122,8 @@ def triangulate_log(log, params=None, settings=None, use_identity=False, progres
     params = default_params("position", log) if params is None else params
     odometry = increments(log)
     mounting = (params.mount_x, params.mount_y, params.mount_yaw)
-    motion, motion_cov = of_sensor(*moments(odometry, params), mounting)
-    lines = _Lines(log, params, settings, use_identity)
+    motion, motion_cov = sensor_motion(*moments(odometry, params), mounting)
+    lines = _LogLines(log, params, settings, use_identity)
     first = np.searchsorted(log.frame, np.arange(len(log.frame_time) + 1))
     window, tracks = _Window(), []
     point, cov = np.full((len(log.frame), 2), np.nan), np.full((len(log.frame), 3), np.nan)
@@ -139,14 +139,16 @@ def triangulate_log(log, params=None, settings=None, use_identity=False, progres
         if progress and (j % 50 == 0 or j + 1 == len(log.frame_time)):
             progress(j + 1, len(log.frame_time))
     skipped = {k: v for k, v in log.skipped.items() if not k.startswith(_PREFIX)}
-    counts = np.bincount(why, minlength=len(WHY))
-    skipped |= {_PREFIX + WHY[i]: int(counts[i]) for i in range(len(WHY)) if i != OK and counts[i]}
-    noise = {"position_scale": _scale(base, odometry.distance, settings)} | log.noise
+    counts = np.bincount(why, minlength=len(OUTCOMES))
+    skipped |= {
+        _PREFIX + OUTCOMES[i]: int(counts[i]) for i in range(len(OUTCOMES)) if i != OK and counts[i]
+    }
+    noise = {"position_scale": _position_scale(base, odometry.distance, settings)} | log.noise
     found = {"point": point, "point_cov": cov, "point_baseline": base}
     return replace(log, **found, noise=noise, skipped=skipped)
 
 
-def _scale(base, distance, settings):
+def _position_scale(base, distance, settings):
     """`position_scale` for points on these baselines [n] m, of frames these distances [T] apart."""
     shared = 1.0
     if settings.pairs == "overlapping" and np.isfinite(base).any():
@@ -157,7 +159,7 @@ def _scale(base, distance, settings):
 _PREFIX = NOT_USED + "bearing without a point: "
 
 
-class _Lines:
+class _LogLines:
     """What matching needs of all rows of a log."""
 
     def __init__(self, log, params, settings, use_identity):
@@ -229,7 +231,7 @@ def _measure(tracks, window, lines, settings, out):
             most = 1 / settings.matching.nearest
             track.depth = (max(q - spread, 0.0), min(q + spread, most))
     point, cov, base, why = out
-    start = [_start(track, window, settings) for track in tracks]
+    start = [_pair_start(track, window, settings) for track in tracks]
     why[row] = SHORT
     moved = window.path[window.index([seen[0] for seen in oldest])]
     why[row[moved < settings.triangulation.least_baseline]] = STILL
@@ -239,8 +241,8 @@ def _measure(tracks, window, lines, settings, out):
     seen = [tracks[i].seen[start[i]] for i in ready]
     row = row[ready]
     found = _triangulate(seen, row, window, lines, settings)
-    between = [_between(tracks[i], start[i], window) for i in ready]
-    fits = _fits(found.point, seen, between, window, lines)
+    between = [_sighting_between(tracks[i], start[i], window) for i in ready]
+    fits = _confirmed_between(found.point, seen, between, window, lines)
     point[row] = np.where(fits[:, None], found.point, np.nan)
     cov[row] = np.where(fits[:, None], found.cov, np.nan)
     path = window.path[window.index([s[0] for s in seen])]
@@ -253,7 +255,7 @@ def _measure(tracks, window, lines, settings, out):
             tracks[i].begin = last + (settings.pairs == "disjoint")
 
 
-def _start(track, window, settings):
+def _pair_start(track, window, settings):
     """Place in `track.seen` of the sighting that a pair with the newest begins at, or None."""
     frames = [seen[0] for seen in track.seen[track.begin : -1]]
     path = window.path[window.index(frames)] if frames else np.empty(0)
@@ -264,14 +266,14 @@ def _start(track, window, settings):
     return track.begin + int(far[-1] if settings.pairs == "overlapping" else far[0])
 
 
-def _between(track, start, window):
+def _sighting_between(track, start, window):
     """The sighting half-way between a pair's two, by path; the pair's first if there is none."""
     frames = [seen[0] for seen in track.seen[start:-1]]
     path = window.path[window.index(frames)]
     return track.seen[start + int(np.argmin(np.abs(path - path[0] / 2)))]
 
 
-def _fits(point, seen, between, window, lines):
+def _confirmed_between(point, seen, between, window, lines):
     """Whether the sightings between point to where the points are; most false pairs do not."""
     at, first = (window.index([s[0] for s in some]) for some in (between, seen))
     row = np.array([s[1] for s in between])

@@ -36,7 +36,7 @@ class Panorama(NamedTuple):
 
     def bearing(self, column):
         """Azimuth [rad] in (-pi, pi] of fractional columns, which may lie beyond the seam."""
-        return _wrapped(pi - (np.asarray(column) + 0.5) * self.step)
+        return _wrap(pi - (np.asarray(column) + 0.5) * self.step)
 
     def column(self, bearing):
         """Fractional column in [-0.5, W - 0.5) of an azimuth [rad]."""
@@ -73,7 +73,7 @@ def panorama(camera, columns=1440, elevation=None):
     edges = np.linspace(high, low, rows + 1)
     up = (edges[1:] + edges[:-1]) / 2
     view = _view(camera, directions(azimuth[None, :], up[:, None]))
-    return Panorama(_fixed(azimuth), _fixed(up), *view)
+    return Panorama(_freeze(azimuth), _freeze(up), *view)
 
 
 @lru_cache(maxsize=CACHED)
@@ -147,14 +147,14 @@ def _view(camera, direction):
         valid = ((pixel >= 0) & (pixel <= np.array([camera.width, camera.height]) - 1)).all(-1)
     valid &= (up >= low - 1e-9) & (up <= high + 1e-9)
     pixel = np.where(valid[..., None], pixel, -2.0).astype(np.float32)
-    return View(_fixed(pixel[..., 0].copy()), _fixed(pixel[..., 1].copy()), _fixed(valid))
+    return View(_freeze(pixel[..., 0].copy()), _freeze(pixel[..., 1].copy()), _freeze(valid))
 
 
-def _fixed(array):
+def _freeze(array):
     array.setflags(write=False)
     return array
 
 
-def _wrapped(angle):
+def _wrap(angle):
     """The angle [rad] in (-pi, pi]."""
     return pi - (pi - angle) % (2 * pi)

@@ -151,7 +151,7 @@ def compose(first, first_cov, second, second_cov):
     return mean, cov
 
 
-def of_sensor(mean, cov, mounting):
+def sensor_motion(mean, cov, mounting):
     """Motion of a sensor mounted at (x, y, yaw), from that of the robot; [T, 3] and [T, 3, 3]."""
     mx, my, yaw = mounting
     c, s = np.cos(mean[:, 2]), np.sin(mean[:, 2])
