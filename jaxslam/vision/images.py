@@ -1,19 +1,27 @@
 """Images from files, folders and videos, checked before and after they are decoded.
 
-A decoder may ask for gigabytes because a small file says so, may hand back nothing without a word,
-or half a picture: so the header is read first, and the file's end is looked for.
+OpenCV may allocate gigabytes because a small header says so, and may return half an image of a
+truncated file. Pillow therefore reads the header first and checks that the file is complete.
+OpenCV decodes, since other JPEG decoders round differently.
 """
 
 import glob
+import io
 import os
 import re
 import sys
+import warnings
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from PIL.BmpImagePlugin import BmpImageFile
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
+from PIL.PpmImagePlugin import PpmImageFile
+from PIL.TiffImagePlugin import TiffImageFile
 
-from jaxslam.vision.image_header import MAX_PIXELS, check_pixels, complete, read_header
-
+MAX_PIXELS = 100_000_000
 MAX_BYTES = 1 << 29  # of a file; 100 Mpixel of three bytes, uncompressed, fit
 if "cv2" not in sys.modules:  # it reads its limit once, when imported; a user's own limit stays
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))
@@ -23,6 +31,23 @@ import cv2  # noqa: E402
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tiff")
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg", ".wmv")
 REMEDY_16 = "only 8 are read; convert it first, e.g. with `convert IMAGE -depth 8 OUT`"
+# By the first bytes of a file. `PIL.Image.open` would refuse large images in its own words.
+PARSERS = {
+    b"\x89PNG": PngImageFile,
+    b"\xff\xd8\xff": JpegImageFile,
+    b"BM": BmpImageFile,
+    b"II*\0": TiffImageFile,
+    b"MM\0*": TiffImageFile,
+    **{b"P%d" % kind: PpmImageFile for kind in range(1, 7)},
+}
+
+
+class Header(NamedTuple):
+    """Size of an image in pixels, and its bits per channel."""
+
+    width: int
+    height: int
+    bits: int
 
 
 def read_image(path):
@@ -32,10 +57,10 @@ def read_image(path):
     Raises `ValueError` naming the file and what is wrong with it.
     """
     data = _read_bytes(path)
-    header = read_header(path, data)
+    parsed, header = _parse_header(path, data)
     if header.bits > 8:
         raise ValueError(f"{path}: {header.bits} bits per channel; {REMEDY_16}")
-    if not complete(data):
+    if not _is_complete(parsed):
         raise ValueError(f"{path}: truncated: the file ends before its image does")
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
@@ -52,7 +77,53 @@ def read_image(path):
 
 def image_header(path):
     """`Header` of an image file, without decoding it. Raises `ValueError`."""
-    return read_header(path, _read_bytes(path))
+    return _parse_header(path, _read_bytes(path))[1]
+
+
+def _parse_header(path, data):
+    """Pillow's image, not decoded yet, and the `Header` of a file's bytes."""
+    parse = next((parse for start, parse in PARSERS.items() if data.startswith(start)), None)
+    if parse is None:
+        raise ValueError(f"{path}: not a PNG, JPEG, PGM, PPM, BMP or TIFF image")
+    try:
+        with warnings.catch_warnings(action="ignore"):  # of damaged metadata, which is not used
+            image = parse(io.BytesIO(data))
+    except (SyntaxError, OSError, ValueError):
+        fault = "truncated, damaged or of an unsupported kind: its header can't be read"
+        raise ValueError(f"{path}: {fault}") from None
+    check_pixels(path, *image.size)
+    return image, Header(*image.size, _bits_per_channel(image))
+
+
+def _bits_per_channel(image):
+    """Bits per channel, from the raw mode that Pillow decodes: 16 of "RGB;16B", else mostly 8."""
+    mode = image.tile[0][3]
+    mode, *more = [mode] if isinstance(mode, str) else mode
+    if isinstance(image, PpmImageFile) and more:
+        return int(more[0]).bit_length()  # of the largest value
+    if isinstance(image, BmpImageFile):
+        return 8  # the 16 of "BGR;16" are those of a pixel
+    number = re.search(r";(\d+)", mode)
+    return int(number[1]) if number else 8
+
+
+def check_pixels(path, width, height):
+    if width < 1 or height < 1 or width * height > MAX_PIXELS:
+        limit = MAX_PIXELS // 1_000_000
+        raise ValueError(f"{path}: {width} x {height} pixels; 1 to {limit} million are allowed")
+
+
+def _is_complete(image):
+    """Whether the file of a Pillow image goes on to its end, where OpenCV may not miss it."""
+    try:
+        if isinstance(image, PngImageFile):
+            image.verify()  # checksums, without decoding
+        elif isinstance(image, JpegImageFile):
+            image.draft("L", (1, 1))  # decode an eighth of the size: enough to reach the end
+            image.load()
+    except (SyntaxError, OSError):
+        return False
+    return True
 
 
 def check_size(image, camera, name):
