@@ -1,4 +1,4 @@
-"""The camera formats of OCamCalib, Kalibr and OpenCV: text <-> fields of a `Camera`.
+"""Camera formats of OCamCalib, Kalibr and OpenCV: text <-> fields of a `Camera`.
 
 OCamCalib's axes are (row, column) and its z points away from the scene, so a = -a_ocam; its
 polynomial is in px, lowest power first, as is the inverse one, which takes atan(z / r) to r.
@@ -22,7 +22,7 @@ OCAM = (
     'image size: "height" and "width"',
 )
 OCAM_NAMES = ("direct polynomial", "inverse polynomial", "center", "affine", "image size")
-INVERSE_ERROR, INVERSE_DEGREE = 0.01, 25  # px at most, by a degree of at most
+INVERSE_ERROR, INVERSE_DEGREE = 0.01, 25  # largest error [px] and degree
 
 
 def from_ocamcalib(text):
@@ -34,7 +34,7 @@ def from_ocamcalib(text):
     values = [_floats(name, line) for name, line in zip(OCAM_NAMES, lines, strict=False)]
     for name, value in zip(OCAM_NAMES[:2], values, strict=False):
         if len(value) < 2 or value[0] != len(value) - 1:
-            raise ValueError(f"{name} says {value[0]:g} coefficients but has {len(value) - 1}")
+            raise ValueError(f"{name} announces {value[0]:g} coefficients but has {len(value) - 1}")
     for name, value, count in zip(OCAM_NAMES[2:], values[2:], (2, 3, 2), strict=False):
         if len(value) != count:
             raise ValueError(f"{name} has {len(value)} numbers; must be {count}")
@@ -50,7 +50,7 @@ def from_ocamcalib(text):
 
 
 def to_ocamcalib(camera):
-    """Text of a calib_results.txt. Raises `ValueError` if it can't hold the camera."""
+    """Text of a calib_results.txt. Raises `ValueError` if the format can't hold the camera."""
     if camera.model != "polynomial" or camera["p1"] or camera["p2"]:
         raise ValueError(
             "OCamCalib's file holds a polynomial camera without decentring (p1, p2) only;"
@@ -76,7 +76,7 @@ def to_ocamcalib(camera):
 
 
 def _inverse(direct, farthest):
-    """Coefficients, lowest power first, of r [px] over atan(z / r), as far as it is one to one."""
+    """Fit r [px] by powers of atan(z / r), lowest first, as far as it is one to one."""
     r = np.linspace(farthest / 2000, farthest, 2000)
     angle = np.arctan(np.polynomial.polynomial.polyval(r, direct) / r)
     falling = np.flatnonzero(np.diff(angle) <= 0)
@@ -100,7 +100,7 @@ def from_kalibr(text):
         raise ValueError(f"is not YAML ({str(error).splitlines()[0]})") from None
     camera = chain.get("cam0") if isinstance(chain, dict) else None
     if not isinstance(camera, dict):
-        raise ValueError("has no cam0, so it is no camchain of Kalibr")
+        raise ValueError("has no cam0, so it is not a camchain of Kalibr")
     for name, allowed in (("camera_model", "omni"), ("distortion_model", "radtan")):
         if camera.get(name) != allowed:
             raise ValueError(f"cam0.{name} is {camera.get(name)!r}; must be {allowed}")
@@ -117,7 +117,7 @@ def from_kalibr(text):
 
 
 def to_kalibr(camera):
-    """Text of a camchain. Raises `ValueError` if it can't hold the camera."""
+    """Text of a camchain. Raises `ValueError` if the format can't hold the camera."""
     if camera.model != "unified" or camera["s"]:
         raise ValueError(
             "Kalibr's omni holds a unified camera without skew (s) only; calibrate with simple=True"
@@ -137,7 +137,7 @@ def to_kalibr(camera):
 
 
 def from_opencv(text):
-    """Fields of a `Camera` from camera_matrix, distortion_coefficients, xi, as of cv2.omnidir."""
+    """Fields of a `Camera` from camera_matrix, distortion_coefficients and xi of cv2.omnidir."""
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         found = {}
@@ -165,7 +165,7 @@ def from_opencv(text):
 
 
 def to_opencv(camera):
-    """Text that cv2.FileStorage reads. Raises `ValueError` if it can't hold the camera."""
+    """Text for cv2.FileStorage. Raises `ValueError` if the format can't hold the camera."""
     if camera.model != "unified":
         raise ValueError("OpenCV's file holds a unified camera only; calibrate with that model")
     fx, fy, s, cx, cy = (camera[name] for name in ("fx", "fy", "s", "cx", "cy"))
