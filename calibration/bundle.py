@@ -72,7 +72,7 @@ class Solution:
         return float(np.sqrt(np.mean(self.distance**2)))
 
 
-def freedom(model, names):
+def free_directions(model, names):
     """[P, F]: unit directions of the named parameters; the affine's d and e are one, "e"."""
     every = parameter_names(model)
     free = np.zeros((len(every), len(names)))
@@ -110,10 +110,10 @@ def adjust(model, corners, start, free, steps=60):
     Huber's weights times those of `start`; `free` of [P, 0] estimates the poses alone.
     """
     weight = np.ones(len(corners.pixel)) if start.weight is None else start.weight
-    best = _Linear(model, corners, replace(start, free=free, weight=weight))
+    best = _Linearization(model, corners, replace(start, free=free, weight=weight))
     damping = 1e-3
     for _ in range(steps):
-        moved = _Linear(model, corners, best.step(damping))
+        moved = _Linearization(model, corners, best.step(damping))
         before, after = best.cost(best.scale), moved.cost(best.scale)
         damping = max(damping / 10, 1e-9) if after < before else damping * 10
         if after < before:
@@ -123,7 +123,7 @@ def adjust(model, corners, start, free, steps=60):
     return replace(best.solution, residual=best.residual, information=best.information())
 
 
-class _Linear:
+class _Linearization:
     """A solution with its residuals [n, 2] px and their derivatives."""
 
     def __init__(self, model, corners, solution):
@@ -160,7 +160,7 @@ class _Linear:
     def step(self, damping):
         """The solution moved by one damped step."""
         camera, cross, own, pull_camera, pull = self.normal()
-        camera, own = _damped(camera, damping), _damped(own, damping)
+        camera, own = _damp(camera, damping), _damp(own, damping)
         solved = np.linalg.solve(own, np.concatenate([cross.mT, pull[..., None]], -1))
         schur = camera - np.einsum("bfj,bjg->fg", cross, solved[..., :-1])
         right = pull_camera - np.einsum("bfj,bj->f", cross, solved[..., -1])
@@ -177,9 +177,7 @@ class _Linear:
     def information(self):
         """[F, F] per px^2: of the camera's free directions, whatever the poses are."""
         camera, cross, own, _, _ = self.normal()
-        return camera - np.einsum(
-            "bfj,bjg->fg", cross, np.linalg.solve(_damped(own, 0.0), cross.mT)
-        )
+        return camera - np.einsum("bfj,bjg->fg", cross, np.linalg.solve(_damp(own, 0.0), cross.mT))
 
 
 def robust_scale(length):
@@ -196,7 +194,7 @@ def rotation(vector):
     return np.eye(3) + np.sinc(angle / np.pi) * k + 0.5 * np.sinc(angle / 2 / np.pi) ** 2 * k @ k
 
 
-def _damped(matrix, damping):
+def _damp(matrix, damping):
     """The matrix with its diagonal grown (Marquardt), and never zero."""
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     least = 1e-12 * np.max(diagonal, initial=1.0)

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.bundle import OUTLIER, Corners, Solution, adjust, freedom, robust_scale
+from calibration.bundle import OUTLIER, Corners, Solution, adjust, free_directions, robust_scale
 from calibration.corners import VARIANTS, board_points, check_board, find_again, find_views
-from calibration.coverage import Bearings, Coverage, bearings, coverage, warnings
+from calibration.coverage import Bearings, Coverage, bearing_uncertainty, coverage, list_warnings
 from calibration.initial import first_solution
 from jaxslam.vision.camera import Camera, parameter_names
 
@@ -72,7 +72,7 @@ class Calibration:
 
 
 @contextmanager
-def _determined():
+def _explain_singular():
     """Degenerate boards make some matrix or other singular: say what that means."""
     try:
         yield
@@ -80,7 +80,7 @@ def _determined():
         raise ValueError(UNDETERMINED) from None
 
 
-@_determined()
+@_explain_singular()
 def calibrate_camera(
     source,
     board=(6, 7),
@@ -100,13 +100,13 @@ def calibrate_camera(
     """
     check_board(board, square)
     views = find_views(source, board, progress)
-    _enough(len(views.names), views.rejected)
+    _check_count(len(views.names), views.rejected)
     points = board_points(board, square)
     given = dict(size=views.size, model=model, mirror=mirror, lens=lens, order=order, simple=simple)
     trials = []
     for variant in VARIANTS:
         corners = _gather(views.corners[variant], points, views.size, views.names)[1]
-        solution = _last(_fits(corners, model, order, simple))
+        solution = _highest_order(_fit_orders(corners, model, order, simple))
         trials.append((_inlier_rms(solution), variant, corners, solution))
     _, variant, corners, solution = min(trials, key=lambda trial: trial[0])
     pixels, again = _find_outliers_again(views.files, corners, solution, board)
@@ -114,7 +114,7 @@ def calibrate_camera(
     return replace(result, variant=variant, again=again, rejected=views.rejected + result.rejected)
 
 
-@_determined()
+@_explain_singular()
 def calibrate_corners(
     pixels,
     points,
@@ -135,22 +135,22 @@ def calibrate_corners(
         raise ValueError(f"order {order!r} of the polynomial: must be 4, 5 or 6")
     names = [f"board {i}" for i in range(len(pixels))] if names is None else list(names)
     names, corners, rejected = _gather(pixels, points, size, names)
-    fits = _fits(corners, model, order, simple)
-    misfit = _misfitting(corners, _last(fits))
+    fits = _fit_orders(corners, model, order, simple)
+    misfit = _find_misfits(corners, _highest_order(fits))
     if misfit:
         share = "half of its corners are outliers: another board, or corners in a wrong order"
         rejected += [(names[b], share) for b in misfit]
         left = [b for b in range(corners.boards) if b not in misfit]
         names, corners = [names[b] for b in left], corners.of_boards(left)
-        _enough(len(names), rejected)
-        fits = _fits(corners, model, order, simple)
-    order, scores = _choose(corners, fits, model, order, simple)
+        _check_count(len(names), rejected)
+        fits = _fit_orders(corners, model, order, simple)
+    order, scores = _choose_order(corners, fits, model, order, simple)
     solution = fits[order]
-    camera = _camera(solution, corners, model, mirror, lens)
-    cover = coverage(camera, corners, _distances(corners, solution))
-    uncertain = bearings(camera, cover.radius)
-    told = warnings(corners, names, cover, uncertain)
-    _refuse(cover, uncertain, told)
+    camera = _make_camera(solution, corners, model, mirror, lens)
+    cover = coverage(camera, corners, _board_distances(corners, solution))
+    uncertain = bearing_uncertainty(camera, cover.radius)
+    told = list_warnings(corners, names, cover, uncertain)
+    _check_bearings(cover, uncertain, told)
     return Calibration(
         camera=camera,
         solution=solution,
@@ -167,7 +167,7 @@ def calibrate_corners(
     )
 
 
-def held_out(corners, fits, model, order=None, simple=False, folds=2):
+def cross_validate(corners, fits, model, order=None, simple=False, folds=2):
     """{order: residuals' lengths [n] px} of boards by cameras that were fitted to the others.
 
     `fits`: {order: `Solution`} of all boards; the poses of those left out are estimated anew, the
@@ -178,22 +178,22 @@ def held_out(corners, fits, model, order=None, simple=False, folds=2):
         out = np.arange(corners.boards) % folds == fold
         inside, outside = corners.of_boards(np.flatnonzero(~out)), np.flatnonzero(out)
         outer = corners.of_boards(outside)
-        cameras = _fits(inside, model, order, simple)
+        cameras = _fit_orders(inside, model, order, simple)
         for key, fit in fits.items():
             poses = fit.rotation[outside], fit.translation[outside]
             start = Solution(cameras[key].params, *poses)
-            rest = adjust(model, outer, start, freedom(model, ()))
+            rest = adjust(model, outer, start, free_directions(model, ()))
             length[key][out[corners.board]] = rest.distance
     return length
 
 
-def _choose(corners, fits, model, order, simple):
+def _choose_order(corners, fits, model, order, simple):
     """The order to take and {order: RMS px on boards left out}, outliers left aside."""
     taken = list(fits)[-1] if order or model == "unified" else next(iter(fits))
     if corners.boards < 2 * LEAST_BOARDS:
         return taken, {}
-    good = _last(fits).weight > 0
-    left = held_out(corners, fits, model, order, simple)
+    good = _highest_order(fits).weight > 0
+    left = cross_validate(corners, fits, model, order, simple)
     scores = {key: math.sqrt(np.mean(d[good] ** 2)) for key, d in left.items()}
     return (taken if order else min(scores, key=scores.get)), scores
 
@@ -212,7 +212,7 @@ def _gather(pixels, points, size, names):
             rejected.append((name, fault))
         else:
             kept.append((name, pixel, point))
-    _enough(len(kept), rejected)
+    _check_count(len(kept), rejected)
     names, pixels, points = zip(*kept, strict=True)
     board = np.repeat(np.arange(len(kept)), [len(p) for p in pixels])
     corners = Corners(np.concatenate(pixels), np.concatenate(points), board, tuple(map(int, size)))
@@ -235,37 +235,37 @@ def _fault(pixel, point, size):
     return None
 
 
-def _enough(count, rejected):
+def _check_count(count, rejected):
     if count < LEAST_BOARDS:
         why = f"; {rejected[0][0]}: {rejected[0][1]}" if rejected else ""
         raise ValueError(f"{count} usable boards; must be {LEAST_BOARDS} or more{why}")
 
 
-def _grow(corners, simple):
+def _fit_order_4(corners, simple):
     """The polynomial of order 4 with affine and decentring, and the names that are free in it."""
     solution, names = first_solution(corners), []
-    solution = adjust("polynomial", corners, solution, freedom("polynomial", ()), steps=10)
+    solution = adjust("polynomial", corners, solution, free_directions("polynomial", ()), steps=10)
     for more in START:
         names += [name for name in more if not (simple and name in NOT_SIMPLE["polynomial"])]
-        solution = adjust("polynomial", corners, solution, freedom("polynomial", names))
-    return _without_outliers("polynomial", corners, solution), names
+        solution = adjust("polynomial", corners, solution, free_directions("polynomial", names))
+    return _refit_without_outliers("polynomial", corners, solution), names
 
 
-def _fits(corners, model, order, simple):
+def _fit_orders(corners, model, order, simple):
     """{order: `Solution`} up to `order`, or up to the highest; {"unified": ...} of that model."""
-    solution, names = _grow(corners, simple)
+    solution, names = _fit_order_4(corners, simple)
     if model == "unified":
-        return {model: _unified(corners, solution, simple)}
+        return {model: _fit_unified(corners, solution, simple)}
     fits = {4: solution}
     for higher in range(5, (order or max(ORDERS)) + 1):
         names = [*names, f"a{higher}"]
         start = replace(solution, weight=None)
-        solution = adjust(model, corners, start, freedom(model, names))
-        fits[higher] = solution = _without_outliers(model, corners, solution)
+        solution = adjust(model, corners, start, free_directions(model, names))
+        fits[higher] = solution = _refit_without_outliers(model, corners, solution)
     return fits
 
 
-def _unified(corners, polynomial, simple):
+def _fit_unified(corners, polynomial, simple):
     """The unified model, begun as a parabolic mirror (xi = 1) that agrees at the centre."""
     params = np.zeros(len(parameter_names("unified")))
     focal = polynomial.params[7] * max(corners.size)  # xi = 1: z = (f^2 - rho^2) / (2 f)
@@ -273,11 +273,11 @@ def _unified(corners, polynomial, simple):
     start = replace(polynomial, params=params, weight=None)
     every = [n for n in parameter_names("unified") if not (simple and n in NOT_SIMPLE["unified"])]
     for names in (("fx", "fy"), ("fx", "fy", "cx", "cy", "xi"), every):
-        start = adjust("unified", corners, start, freedom("unified", names))
-    return _without_outliers("unified", corners, start)
+        start = adjust("unified", corners, start, free_directions("unified", names))
+    return _refit_without_outliers("unified", corners, start)
 
 
-def _without_outliers(model, corners, solution):
+def _refit_without_outliers(model, corners, solution):
     """The solution fitted again without gross outliers, until they stay the same."""
     for _ in range(5):
         scale = robust_scale(solution.distance[solution.weight > 0])
@@ -292,19 +292,19 @@ def _inlier_rms(solution):
     return math.sqrt(np.mean(solution.distance[solution.weight > 0] ** 2))
 
 
-def _last(fits):
+def _highest_order(fits):
     """The `Solution` of the highest order."""
     return list(fits.values())[-1]
 
 
-def _distances(corners, solution):
+def _board_distances(corners, solution):
     """Distance [B] m of the boards, of the middle of what is seen of each."""
     middle = [corners.point[corners.board == b].mean(0) for b in range(corners.boards)]
     arm = np.einsum("bij,bj->bi", solution.rotation[..., :2], middle)
     return np.linalg.norm(arm + solution.translation, axis=1)
 
 
-def _misfitting(corners, solution):
+def _find_misfits(corners, solution):
     """Boards with outliers for half of their corners."""
     bad = np.bincount(corners.board, solution.weight == 0) / np.bincount(corners.board)
     return np.flatnonzero(bad >= 0.5).tolist()
@@ -325,7 +325,7 @@ def _find_outliers_again(files, corners, solution, board):
     return pixels, again
 
 
-def _camera(solution, corners, model, mirror, lens):
+def _make_camera(solution, corners, model, mirror, lens):
     """`Camera` with the covariance of its parameters and the elevations that the boards cover."""
     information, good = solution.information, solution.weight > 0
     degrees = 2 * good.sum() - solution.free.shape[1] - 6 * corners.boards
@@ -351,7 +351,7 @@ def _camera(solution, corners, model, mirror, lens):
     return replace(camera, elevation=(float(high.min()), float(high.max())))
 
 
-def _refuse(cover, uncertain, told):
+def _check_bearings(cover, uncertain, told):
     """Raise `ValueError` for boards that leave the bearings open."""
     why = "".join(f"; {warning}" for warning in told)
     if cover.gap > np.radians(240):

@@ -76,7 +76,7 @@ def ray_change(camera, pixel, ray):
     return -across @ np.linalg.solve(by_ray @ across, by_params)
 
 
-def bearings(camera, radius):
+def bearing_uncertainty(camera, radius):
     """`Bearings` of a camera with a covariance, within radii (low, high) px."""
     pixel = polar_pixels(camera, radius)
     ray = camera.ray(pixel)
@@ -94,7 +94,7 @@ def bearings(camera, radius):
 def azimuth_error(camera, true, radius):
     """Azimuth error [n] rad of a camera against the true one, the common rotation removed, and
     its stated standard deviation [n]: at the pixels of `bearings`."""
-    known = bearings(camera, radius)
+    known = bearing_uncertainty(camera, radius)
     usable = np.isfinite(known.sigma)
     pixel = known.pixel[usable]
     ray, real = camera.ray(pixel), true.ray(pixel)
@@ -103,7 +103,7 @@ def azimuth_error(camera, true, radius):
     return error, known.sigma[usable][inside]
 
 
-def warnings(corners, names, cover, uncertain):
+def list_warnings(corners, names, cover, uncertain):
     """What is doubtful about a set of boards: sentences for the user."""
     told = []
     if corners.boards < 6:

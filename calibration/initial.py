@@ -21,10 +21,10 @@ def first_solution(corners):
     half = max(corners.size) / 2
     boards = [corners.board == b for b in range(corners.boards)]
     points = [corners.point[b] for b in boards]
-    centre = _centre([corners.pixel[b] / half for b in boards], points, np.array(corners.size))
+    centre = _find_centre([corners.pixel[b] / half for b in boards], points, np.array(corners.size))
     pixels = [corners.pixel[b] / half - centre for b in boards]
-    poses = [_pose(*pair) for pair in zip(pixels, points, strict=True)]
-    shape, poses = _radial(pixels, points, poses)
+    poses = [_board_pose(*pair) for pair in zip(pixels, points, strict=True)]
+    shape, poses = _fit_radial(pixels, points, poses)
     params = np.zeros(len(POLYNOMIAL))
     params[[0, 1, 2, 7, 8]] = *(half * centre), 1, *shape
     axes, translation = poses[..., :2], poses[..., 2]
@@ -33,7 +33,7 @@ def first_solution(corners):
     return Solution(params, left @ right, translation)
 
 
-def _centre(pixels, points, size):
+def _find_centre(pixels, points, size):
     """Centre [2], in half image sides, that fits the radial constraint best; a search by grids.
 
     The misfits of the boards are added, not their squares: one board may be wrong.
@@ -67,7 +67,7 @@ def _homogeneous(point):
     return np.concatenate([point, np.ones_like(point[:, :1])], 1)
 
 
-def _pose(pixel, point):
+def _board_pose(pixel, point):
     """[3, 3] with columns r1, r2, t of a board; t's third is open (0), the third row's sign too."""
     lateral = _homography(pixel, point)
     side = (lateral @ _homogeneous(point).T * pixel.T).sum(0)
@@ -79,7 +79,7 @@ def _pose(pixel, point):
     return np.vstack([lateral, [*up, 0]]) / np.sqrt(a + up[0] ** 2)
 
 
-def _radial(pixels, points, poses):
+def _fit_radial(pixels, points, poses):
     """a0, a2 of all boards together and their poses [B, 3, 3], the third rows now known."""
     poses = np.stack(poses)
     rows = [_equations(*each) for each in zip(pixels, points, poses, strict=True)]
@@ -97,7 +97,7 @@ def _radial(pixels, points, poses):
         a = np.linalg.lstsq(design, np.concatenate([f[2] for f in fixed]))[0]
         shape = a[:2] * (np.sign(a[0]) or 1)
         for pose, (terms, height, right) in zip(poses, fixed, strict=True):
-            pose[2] = _nearer(pose[2], terms @ shape, height, right)
+            pose[2] = _choose_sign(pose[2], terms @ shape, height, right)
         if (np.sign(poses[:, 2, :2].sum(1)) == signs).all():
             break
     return shape, poses
@@ -111,7 +111,7 @@ def _equations(pixel, point, pose):
     return np.stack([m, m * rho**2], 1), -rho, rho * (point @ pose[2, :2])
 
 
-def _nearer(row, seen, height, right):
+def _choose_sign(row, seen, height, right):
     """The board's third row with the sign, and the t3, that fit a given radial function."""
     fits = []
     for sign in (1, -1):

@@ -60,7 +60,7 @@ def point_errors(log, gain=1.0):
     pose = truth_at(truth, log.frame_time, GAP)[log.frame[rows]]
     rows, pose = rows[np.isfinite(pose).all(1)], pose[np.isfinite(pose).all(1)]
     require(log, len(rows) >= LEAST, f"at least {LEAST} points where there are true poses")
-    point, cov = gain * log.point[rows], gain**2 * _full(log.point_cov[rows])
+    point, cov = gain * log.point[rows], gain**2 * _to_matrices(log.point_cov[rows])
     lines = in_sensor(log, pose, truth.landmarks)
     off = point[:, None] - lines
     distance = np.einsum("nli,nij,nlj->nl", off, np.linalg.inv(cov), off)
@@ -84,7 +84,7 @@ def point_errors(log, gain=1.0):
     return every.part(kept)
 
 
-def identified(log):
+def identify_lines(log):
     """The log with true identities: each bearing's is the surveyed line nearest to it.
 
     As seen from the true pose; -1 (nothing) where none is within a degree. For lines from images,
@@ -104,7 +104,7 @@ def identified(log):
 
 def coverage(errors):
     """Share of the points within their own 95 % ellipse, as propagated."""
-    return float((_square("propagated normal", (1.0,), errors) < _bound95(np.inf)).mean())
+    return float((_squared_distance("propagated normal", (1.0,), errors) < _bound95(np.inf)).mean())
 
 
 def compare(errors):
@@ -126,18 +126,20 @@ def compare(errors):
             scores.append(_log_density(name, values, errors.part(half)))
         values = _fit(name, errors)
         dof = _moments(name, values, errors)[2]
-        covered = _square(name, values, errors) < _bound95(dof)
+        covered = _squared_distance(name, values, errors) < _bound95(dof)
         named = dict(zip(CANDIDATES[name][0], values.tolist(), strict=True))
         models.append(Model(name, named, float(np.concatenate(scores).mean()), covered.mean()))
     return sorted(models, key=lambda model: -model.held_out)
 
 
-def with_model(model, log):
+def apply_model(model, log):
     """The log with its points' covariances (and a fitted mean taken off) as the model has them."""
     rows = np.flatnonzero(np.isfinite(log.point).all(1))
     point, base = log.point[rows], log.point_baseline
     base = np.full(len(rows), np.nan) if base is None else base[rows]
-    empty = PointErrors(rows, log.frame[rows], point, point, _full(log.point_cov[rows]), base, {})
+    empty = PointErrors(
+        rows, log.frame[rows], point, point, _to_matrices(log.point_cov[rows]), base, {}
+    )
     mean, cov, dof = _moments(model.name, np.array(list(model.values.values())), empty)
     if np.isfinite(dof):  # the filter's update is a normal's: give it the tail's variance
         cov = cov * dof / max(dof - 2, 0.5)
@@ -158,12 +160,12 @@ def in_sensor(log, pose, landmarks):
     return np.stack([c * dx + s * dy, c * dy - s * dx], -1)
 
 
-def _full(cov):
+def _to_matrices(cov):
     xx, xy, yy = cov.T
     return np.stack([xx, xy, xy, yy], -1).reshape(-1, 2, 2)
 
 
-def _sight(point):
+def _sight_axes(point):
     """[n, 2, 2]: columns are the unit vectors along and across the line of sight."""
     along = point / np.linalg.norm(point, axis=1, keepdims=True)
     return np.stack([along, np.stack([-along[:, 1], along[:, 0]], 1)], -1)
@@ -171,7 +173,7 @@ def _sight(point):
 
 def _along_across(point, along, across, both=0.0):
     """Covariances [n, 2, 2] from variances along and across the line of sight."""
-    frame = _sight(point)
+    frame = _sight_axes(point)
     inner = np.zeros((len(point), 2, 2))
     inner[:, 0, 0], inner[:, 1, 1] = along, across
     inner[:, 0, 1] = inner[:, 1, 0] = both
@@ -202,7 +204,7 @@ def _moments(name, values, errors):
     zero, at = np.zeros_like(errors.true), errors.true
     if name == "one fitted normal":
         mean_along, mean_across, along, across, slope = values
-        mean = (_sight(at) @ np.array([mean_along, mean_across])[:, None])[..., 0]
+        mean = (_sight_axes(at) @ np.array([mean_along, mean_across])[:, None])[..., 0]
         both = slope * along
         cov = _along_across(at, along**2, across**2 + slope**2 * along**2, both * along)
         return mean, cov, np.inf
@@ -248,7 +250,7 @@ def _fit(name, errors):
     return values(best.x)
 
 
-def _square(name, values, errors):
+def _squared_distance(name, values, errors):
     """Squared distance [n] of the errors in units of a candidate's covariance."""
     mean, cov, _ = _moments(name, values, errors)
     off = errors.point - errors.true - mean
@@ -258,7 +260,7 @@ def _square(name, values, errors):
 def _log_density(name, values, errors):
     """Log density [n] of the errors: normal, or Student's t with `dof` degrees of freedom."""
     _, cov, dof = _moments(name, values, errors)
-    square = _square(name, values, errors)
+    square = _squared_distance(name, values, errors)
     half = -np.linalg.slogdet(cov)[1] / 2 - np.log(2 * np.pi)
     if np.isinf(dof):
         return half - square / 2

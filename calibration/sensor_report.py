@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.odometry import ODOMETRY
-from calibration.points import Model, PointErrors, compare, coverage, identified, point_errors
+from calibration.points import Model, PointErrors, compare, coverage, identify_lines, point_errors
 from calibration.sensor import ErrorModel, fit
 from jaxslam.logs.truth import truth_at
 from jaxslam.parameters import TABLE, Params
@@ -31,7 +31,7 @@ def calibrate_sensor(log):
     Lines that nobody has labelled are named by the surveyed line at their bearing.
     """
     unnamed = log.identity is None and (log.truth is None or log.truth.identity is None)
-    named = identified(log) if unnamed else log
+    named = identify_lines(log) if unnamed else log
     bearing = fit(named)
     if not log.has("position") or log.point is None:
         return SensorReport(bearing, None, [])
@@ -52,7 +52,7 @@ def values(report):
     return {k: v for k, v in found.items() if k in Params._fields}, errors
 
 
-def for_filter(report, base):
+def filter_params(report, base):
     """`Params` for a run, from those it would have without: the motion, and how sharp points are.
 
     Bearings keep what `base` says: with noise as small as the lines' own, the few particles that
@@ -73,7 +73,7 @@ def text(report):
         error = f"{errors[name]:.2g}" if name in errors else ""
         lines.append(f"{name:<16}{value:>11.5g}{error:>12}  {TABLE[name].unit}")
     if report.models:
-        lines += ["", _counted(report.errors), ""]
+        lines += ["", _describe_errors(report.errors), ""]
         lines.append(f"{'error model of a point':<24}{'nats/point':>11}{'in 95 %':>9}  parameters")
         for model in report.models:
             shown = ", ".join(f"{k} {v:.4g}" for k, v in model.values.items())
@@ -85,7 +85,7 @@ def text(report):
     return "\n".join(lines)
 
 
-def _counted(errors):
+def _describe_errors(errors):
     off = np.linalg.norm(errors.point - errors.true, axis=1)
     counts = ", ".join(f"{count} {what}" for what, count in errors.counts.items())
     median, most = np.median(off), np.quantile(off, 0.95)

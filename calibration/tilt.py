@@ -63,7 +63,7 @@ class Normals(NamedTuple):
     image: np.ndarray
 
 
-def tilt(images, camera, progress=None):
+def find_tilt(images, camera, progress=None):
     """`Tilt` of a camera from images: an `Images` or a list of (name, image or `ValueError`).
 
     Raises `ValueError` when there are too few vertical lines, all on one side, or far off.
@@ -76,9 +76,9 @@ def tilt(images, camera, progress=None):
             if progress:
                 progress(before + done, total)
 
-        found, names, skipped = _look(images, camera, slope, report)
-        lines = _joined(found, skipped)
-        up, weight = _up(lines, most)
+        found, names, skipped = _find_lines(images, camera, slope, report)
+        lines = _join(found, skipped)
+        up, weight = _fit_up(lines, most)
         looked, camera = camera, camera_with_up(camera, up)
     _check_change(given, camera)
     kept = weight > 0
@@ -131,7 +131,7 @@ def _check_change(given, found):
         )
 
 
-def _look(images, camera, slope, report):
+def _find_lines(images, camera, slope, report):
     """`Normals` of each usable image, all names, and the skipped images' reasons with counts."""
     found, names, skipped, first = [], [], {}, {}
     for index, (name, image) in enumerate(images):
@@ -172,7 +172,7 @@ def _normals(image, camera, slope, index):
     return Normals(vector[once, :, 0], sigma[once], np.full(int(once.sum()), index))
 
 
-def _joined(found, skipped):
+def _join(found, skipped):
     lines = sum(len(normals.sigma) for normals in found)
     if lines < LEAST_LINES:
         reasons = "".join(f"; {count} skipped: {reason}" for reason, count in skipped.items())
@@ -183,7 +183,7 @@ def _joined(found, skipped):
     return Normals(*(np.concatenate(part) for part in zip(*found, strict=True)))
 
 
-def _up(lines, most):
+def _fit_up(lines, most):
     """Up [3] (z = 1) within `most` [rad] of z, and the lines' weights [n]: 0 for what leans."""
     trial = np.linspace(-most, most, GRID)
     x, y = (part.ravel() for part in np.meshgrid(trial, trial))

@@ -23,7 +23,7 @@ import numpy as np
 from line_truth import CONTRAST, TALL, identified, named
 
 from calibration import sensor_report
-from calibration.points import coverage, point_errors, with_model
+from calibration.points import apply_model, coverage, point_errors
 from jaxslam import config_for, default_params, run
 from jaxslam.logs.truth import truth_at
 from jaxslam.results.metrics import association_accuracy, ate, pair_by_distance
@@ -334,7 +334,9 @@ def models_in_the_filter(report, log, seed, particles):
     lines = ["| error model of a point | nats per held-out point | in 95 % | path filtered [m] "
              "| landmarks [m] | mapped | spurious |", "|---" * 7 + "|"]  # fmt: skip
     for model in report.models:
-        result = estimated(with_model(model, log), "position hidden", particles, seed, refine=False)
+        result = estimated(
+            apply_model(model, log), "position hidden", particles, seed, refine=False
+        )
         got = score(result, seed, log)
         told = f"{model.held_out:.2f} | {100 * model.coverage:.0f} %"
         cells = f"{got['path_filtered_m']:.3f} | {got['landmarks_filtered_m']:.3f}"

@@ -57,7 +57,7 @@ def camera(
     with bar("finding corners") as progress:
         found = calibrate_camera(
             list(images) if len(images) > 1 else images[0],
-            _board(board),
+            _parse_board(board),
             square,
             model=model,
             mirror=mirror,
@@ -89,8 +89,7 @@ def tilt(
 
     Example: jaxslam calibrate tilt images/ --camera camera.toml --out level.toml
     """
-    from calibration.tilt import camera_with_tilt, describe
-    from calibration.tilt import tilt as find_tilt
+    from calibration.tilt import camera_with_tilt, describe, find_tilt
     from jaxslam.vision.camera_files import load_camera, save_camera
     from jaxslam.vision.images import Images
 
@@ -142,7 +141,7 @@ def sensor(
         report = sensor_report.calibrate_sensor(drive)
     print(sensor_report.text(report))
     base = default_params("position" if report.models else "bearing", drive)
-    params = sensor_report.for_filter(report, base)
+    params = sensor_report.filter_params(report, base)
     errors = sensor_report.values(report)[1]
     save_params(
         out, params, {k: v for k, v in errors.items() if getattr(base, k) != getattr(params, k)}
@@ -194,7 +193,7 @@ def extract(
     except KeyboardInterrupt:
         warn("stopped; the same command again goes on from here")
         raise
-    return _account(log, out)
+    return _summarize(log, out)
 
 
 def triangulate(
@@ -218,7 +217,7 @@ def triangulate(
         robot = load_params(params, default_params("position", given)) if params else None
         found = triangulate_log(given, robot, progress=progress)
     save_log(out, found)
-    return _account(found, out, " --sensor position", given.skipped)
+    return _summarize(found, out, " --sensor position", given.skipped)
 
 
 def room(
@@ -259,7 +258,7 @@ def room(
     print(f"{out}: {frames} images; next: jaxslam extract {out / 'images'} {given} --out OUT.npz")
 
 
-def _board(text):
+def _parse_board(text):
     """Corners along both sides, of text like 6x7."""
     sides = [int(side) if side.isdecimal() else 0 for side in text.lower().split("x")]
     if len(sides) != 2 or min(sides) < 2:
@@ -267,7 +266,7 @@ def _board(text):
     return tuple(sides)
 
 
-def _account(log, out, how="", told=()):
+def _summarize(log, out, how="", told=()):
     """Print what a log of lines holds and what was left out, but for what was `told` when the log
     was made; the exit code."""
     import numpy as np

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from calibration.bundle import Corners, derivatives, rotation
-from calibration.camera import calibrate_camera, calibrate_corners, held_out
+from calibration.camera import calibrate_camera, calibrate_corners, cross_validate
 from calibration.camera_report import draw, text
 from calibration.coverage import angle_change, azimuth_error
 from calibration.initial import first_solution
@@ -239,7 +239,7 @@ def test_report_and_picture(tmp_path):
 
 
 def held_out_px(found, order=None):
-    length = held_out(found.corners, {found.order: found.solution}, "polynomial", found.order)
+    length = cross_validate(found.corners, {found.order: found.solution}, "polynomial", found.order)
     d = length[found.order]
     return d.mean(), np.sqrt(np.mean(d**2))
 

@@ -222,7 +222,7 @@ def test_places_that_are_none(room, at, refuse):
     assert "none.toml: can't be read" in refuse(*replaced("room/camera.toml", "none.toml"))
     told = refuse(*replaced("room/camera.toml", "room/poses.csv"))
     assert "poses.csv: a camera file ends in one of .toml, .txt, .yaml, .yml" in told
-    assert "seed is no field" in refuse(*replaced("room/camera.toml", "room/room.toml"))
+    assert "seed is not a field" in refuse(*replaced("room/camera.toml", "room/room.toml"))
     assert "log.dat: a log is a .npz file; name it like log.npz" in refuse(
         *replaced("log.npz", "log.dat")
     )
@@ -238,7 +238,7 @@ def test_drawings_never_replace_the_images(room, at, call, refuse):
     before = (room / "images" / "000000.png").read_bytes()
     for more in ((), ("--overwrite",)):
         line = refuse(*EXTRACT, "--overlay", "room/../room/images", *more)
-        assert "the images themselves are there; choose another for drawings" in line
+        assert "the images themselves are there; choose another place for drawings" in line
     (at / "lines.avi").write_bytes(b"mine")
     assert "lines.avi: exists; choose another" in refuse(*EXTRACT, "--overlay", "lines.avi")
     assert "exists; choose another name or add --overwrite" in refuse(*EXTRACT, "--overlay", room)
