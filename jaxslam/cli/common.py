@@ -31,7 +31,7 @@ OutLog = option(Path, "the log to write, a .npz file")
 
 
 @contextmanager
-def bar(what, compiles=False, shown=True):
+def progress_bar(what, compiles=False, shown=True):
     """A progress bar on stderr; gives a function of (done, total, text to show), or None without a
     terminal.
 

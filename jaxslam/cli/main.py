@@ -25,9 +25,9 @@ from jaxslam.cli.common import (
     Sensor,
     Start,
     at_least,
-    bar,
     check_new,
     option,
+    progress_bar,
     warn,
 )
 from jaxslam.config import ASSOCIATIONS, PROPOSALS
@@ -129,7 +129,7 @@ def run(
     place = cluster.find_address(coordinator, num_processes, process_id)
     if place and place.process:
         supervisor.run_supervised()
-    with bar("reading", shown=place is None or place.process == 0):
+    with progress_bar("reading", shown=place is None or place.process == 0):
         from jaxslam.logs.log_file import load_log
         from jaxslam.logs.slicing import cut
 
@@ -139,7 +139,7 @@ def run(
     if many and (checkpoint_every or resume or place):
         raise ValueError("--seeds and --sweep are for small runs: without checkpoints, one process")
     total = 1 if many else devices * (place.processes if place else 1)
-    model = cli_run.build_model(
+    model = cli_run.config_from_options(
         loaded, sensor, association, particles, landmarks, params, paper, proposal, total,
         rejuvenate, descriptors,
     )  # fmt: skip
@@ -151,14 +151,14 @@ def run(
         if checkpoint_every or resume
         else None
     )
-    task = cli_run.Task(
+    task = cli_run.RunOptions(
         loaded, *model, seed, out, log, part, overwrite, no_refine, long, shared=place is not None
     )
     if many:
-        return cli_run.run_many(task, str(seed) if seeds is None else seeds, sweep, devices)
+        return cli_run.run_batch(task, str(seed) if seeds is None else seeds, sweep, devices)
     if place is None:
         return cli_run.run(task)
-    return cli_run.run_shared(task, place, guarded)
+    return cli_run.run_shared(task, place, run_command)
 
 
 @app.command
@@ -186,23 +186,25 @@ def compare(
 
     Example: jaxslam compare lost-in-the-woods --particles 20,100 --steps 200
     """
-    counts = _counts(particles)
-    with bar("reading"):
+    counts = _parse_counts(particles)
+    with progress_bar("reading"):
         from jaxslam.logs.log_file import load_log
         from jaxslam.reference import compare as sides
 
         loaded = load_log(log)
     rows = []
     for count in counts:
-        model = cli_run.build_model(loaded, sensor, association, count, None, params, paper)
-        with bar(f"{count} particles", compiles=True) as progress:
+        model = cli_run.config_from_options(loaded, sensor, association, count, None, params, paper)
+        with progress_bar(f"{count} particles", compiles=True) as progress:
             rows.append(sides.compare(loaded, *model, seed, steps, every, progress))
     print(sides.table(rows))
     if variants:
         from jaxslam.reference import variants as rules
 
-        with bar("variants", compiles=True) as progress:
-            model = cli_run.build_model(loaded, sensor, association, variants, None, params, paper)
+        with progress_bar("variants", compiles=True) as progress:
+            model = cli_run.config_from_options(
+                loaded, sensor, association, variants, None, params, paper
+            )
             found = rules.variants(loaded, *model, seed, steps, every, rows, progress)
         print(f"\n{rules.table(found)}")
     parted = [row.double for row in rows if row.double.same < row.double.steps]
@@ -235,7 +237,7 @@ def convert(
         raise ValueError("convert: what to read, and the .npz file to write, are needed")
     *sources, out = paths
     check_new(out, overwrite)
-    with bar("reading"):
+    with progress_bar("reading"):
         log = shift_frames(read(sources, robot), time_offset)
     save_log(out, log)
     print(f"{out}: {log}; look at it with: jaxslam check {out}")
@@ -268,7 +270,7 @@ def evaluate(folder: Folder, /, *, json: option(bool, "as JSON") = False, log: M
     """
     from json import dumps
 
-    with bar("reading"):
+    with progress_bar("reading"):
         from jaxslam.results import load
         from jaxslam.results.tables import error_table
 
@@ -282,7 +284,7 @@ def plot(folder: Folder, /, *, log: MovedLog = None):
 
     Example: jaxslam plot runs/demo
     """
-    with bar("drawing"):
+    with progress_bar("drawing"):
         from jaxslam.results.load import plot_folder
 
         paths = plot_folder(folder, log)
@@ -323,7 +325,7 @@ def planar(
     from jaxslam.simulation import planar as worlds
 
     check_new(out, overwrite)
-    with bar("simulating"):
+    with progress_bar("simulating"):
         log = worlds.planar(
             world, seed, landmarks=landmarks, length_m=length, speed=speed, rate_hz=rate,
             odometry_hz=odometry_rate, commands=commands, stop_m=stop, err_tran=err_tran,
@@ -339,10 +341,10 @@ def main(argv=None):
     """Run one command (None: the process's arguments); returns the exit code."""
     tokens = sys.argv[1:] if argv is None else argv
     told = {"exit_on_error": False, "print_error": False, "result_action": "return_value"}
-    return guarded(lambda: app(tokens, **told), at_once=argv is None)
+    return run_command(lambda: app(tokens, **told), at_once=argv is None)
 
 
-def guarded(work, at_once=False):
+def run_command(work, at_once=False):
     """The exit code of some work, after the one line that says what went wrong."""
     failed = 2
     try:
@@ -374,7 +376,7 @@ def guarded(work, at_once=False):
     return failed
 
 
-def _counts(text):
+def _parse_counts(text):
     counts = [int(count) if count.isdecimal() else 0 for count in text.split(",")]
     if min(counts) < 1:
         raise ValueError(f"--particles is {text!r}; must be whole numbers from 1, like 20,100")

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxslam.cli.common import bar, note, warn
+from jaxslam.cli.common import note, progress_bar, warn
 from jaxslam.runs import cluster
 
 FAULT = 70  # exit code of a process that fails by a fault of ours, told to the others
@@ -20,7 +20,7 @@ class CheckpointOptions(NamedTuple):
     resume: bool
 
 
-class Task(NamedTuple):
+class RunOptions(NamedTuple):
     """What `jaxslam run` is to do. `name`: the log's as given; `part`: only a part of it is used;
     `shared`: by several processes."""
 
@@ -41,7 +41,7 @@ class Task(NamedTuple):
         return None if self.part else self.name
 
 
-def build_model(
+def config_from_options(
     log, sensor, association, particles, landmarks, params, paper, proposal=None, devices=1,
     rejuvenate=None, descriptors=None,
 ):  # fmt: skip
@@ -79,7 +79,7 @@ def run_filter(task, checkpoints=None):
     from jaxslam.runs import run
 
     with (
-        bar("filtering", compiles=True) as progress,
+        progress_bar("filtering", compiles=True) as progress,
         cluster.silence_stderr() if task.shared else nullcontext(),
     ):
         result = run.run(
@@ -93,7 +93,7 @@ def run_filter(task, checkpoints=None):
         )
     if task.no_refine:
         return result
-    with bar("refining") as progress:
+    with progress_bar("refining") as progress:
         return run.refine_result(result, progress)
 
 
@@ -109,16 +109,16 @@ def use_devices(count):
 
 def run(task):
     """Filter, refine and write: the command in one process, or in the one that leads."""
-    result = _run_long(task) if task.long else _run_short(task)
+    result = _run_long(task) if task.long else _run_once(task)
     return int(bool(result and result.flags))
 
 
-def _run_short(task):
+def _run_once(task):
     from jaxslam.results import run_folder
 
     run_folder.check_target(task.out, task.overwrite)
     result = run_filter(task)
-    with bar("writing"):
+    with progress_bar("writing"):
         run_folder.save(result, task.out, task.overwrite, log_source=task.source)
     print_summary(result, task.out)
     return result
@@ -133,21 +133,21 @@ def _run_long(task):
     every = offline.parse_interval(every)
     if overwrite and resume:
         raise ValueError("--resume goes on with a run, --overwrite replaces it; choose one")
-    _check_beside(task)
+    _check_log_outside(task)
     with offline.Checkpoints(out, every, resume, overwrite) as checkpoints:
         if checkpoints.finished:
             offline.check_finished(out, task.log, task.config, task.params, task.seed)
             print(f"{out}: is finished already; nothing to do")
             return None
         result = run_filter(task, checkpoints)
-        with bar("writing"):
+        with progress_bar("writing"):
             run_folder.save_into(result, out, log_source=task.source)
         checkpoints.clear()
     print_summary(result, out)
     return result
 
 
-def _check_beside(task):
+def _check_log_outside(task):
     """Raise `ValueError` if the log is where results are replaced."""
     if Path(task.name).resolve().is_relative_to(task.out.resolve()):
         raise ValueError(
@@ -171,14 +171,14 @@ def run_shared(task, place, guarded):
     team = cluster.Team(place, cluster.rendezvous(place, run))
     code = FAULT
     try:
-        code = guarded(lambda: _share(task, place, team))
+        code = guarded(lambda: _run_member(task, place, team))
     except Exception:
         traceback.print_exc()
     finally:
         team.leave(code)
 
 
-def _share(task, place, team):
+def _run_member(task, place, team):
     from jaxslam.runs import checkpoints as offline
     from jaxslam.runs import run
 
@@ -213,18 +213,18 @@ def print_summary(result, out):
         warn(line)
 
 
-def run_many(task, seeds, sweep, devices):
+def run_batch(task, seeds, sweep, devices):
     """A table of runs, with a folder for each; the exit code."""
     from jaxslam.runs import batch
 
     todo = batch.plan_tasks(seeds, task.params, sweep)
-    _check_beside(task)
+    _check_log_outside(task)
     batch.check_target(task.out, task.overwrite)
-    with bar("running", compiles=True) as progress:
+    with progress_bar("running", compiles=True) as progress:
         results = batch.run_tasks(
             task.log, task.config, todo, progress, not task.no_refine, devices
         )
-    with bar("writing"):
+    with progress_bar("writing"):
         batch.save(todo, results, task.out, task.overwrite, task.source)
     print(batch.table(batch.summary_rows(todo, results)))
     print(f"{task.out}: the table is {task.out / batch.TABLE}, with a folder for each run")

@@ -49,15 +49,15 @@ def test_a_reader_that_goes_away_is_no_error():
 
 
 def test_a_terminal_gets_a_bar_and_a_file_does_not(capsys, monkeypatch):
-    with common.bar("filtering", compiles=True) as show:
+    with common.progress_bar("filtering", compiles=True) as show:
         assert show is None
     assert capsys.readouterr() == ("", "")
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    with common.bar("filtering", compiles=True) as show:
+    with common.progress_bar("filtering", compiles=True) as show:
         show(0, 8)
         show(4, 8)
-    with common.bar("refining") as show:
+    with common.progress_bar("refining") as show:
         show(3, None)
     out, err = capsys.readouterr()
     assert out == ""
