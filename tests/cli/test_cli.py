@@ -18,7 +18,7 @@ from jaxslam.results import load
 from jaxslam.runs import run as runner
 from jaxslam.simulation import planar as simulate
 
-MANY = ("--particles", "50", "--no-refine")
+MANY = ("--particles", "50", "--no-smoothing")
 
 
 @pytest.fixture(scope="session")
@@ -362,7 +362,7 @@ def test_too_little_memory_is_told_and_a_fault_of_ours_not_hidden(log, refuse, m
         cli.main(["run", log])
 
 
-@pytest.mark.parametrize("place", ["runner.run", "report.summarise"])
+@pytest.mark.parametrize("place", ["runs.run.run", "results.run_folder.summarise"])
 def test_interrupted_while_filtering_or_writing_leaves_nothing(log, call, monkeypatch, place):
     def interrupted(*given, **named):
         raise KeyboardInterrupt
