@@ -26,6 +26,17 @@ class Odometry(NamedTuple):
     lever: np.ndarray
     lever_var: np.ndarray
 
+    @classmethod
+    def from_displacement(cls, dx, dy, dtheta, duration):
+        """`Odometry` of one interval from its displacement, driven along an arc.
+
+        `dx`, `dy` [m]: in the robot's frame at the interval's start; `dtheta` [rad]: less than a
+        full turn; `duration` [s]. For intervals with reversals or stops, sum up `distance` and
+        `turn` instead, as `increments` does.
+        """
+        distance = np.hypot(dx, dy) / np.sinc(dtheta / (2 * np.pi))  # chord to arc
+        return cls(dx, dy, dtheta, distance, abs(dtheta), duration, 0.5, 1 / 12)
+
 
 def increments(log):
     """Integrate the odometry to each frame from the one before, the first from `log.start`.

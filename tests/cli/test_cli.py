@@ -18,7 +18,7 @@ from jaxslam.results import load
 from jaxslam.runs import run as runner
 from jaxslam.simulation import planar as simulate
 
-MANY = ("--particles", "50", "--no-refine")
+MANY = ("--particles", "50", "--no-smoothing")
 
 
 @pytest.fixture(scope="session")
