@@ -5,7 +5,9 @@ A value that changes a shape or a branch belongs here; a number, which could be 
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 SENSORS = ("range_bearing", "position", "bearing")  # a run takes the first that the log has
 ASSOCIATIONS = ("maximum_likelihood", "known", "sampled")
@@ -69,7 +71,7 @@ class Config:
     rejuvenate: float | None = None
     descriptors: int = 0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         alone = self.sensor == "bearing" and self.association == "maximum_likelihood"
         if self.rejuvenate is None:
             object.__setattr__(self, "rejuvenate", REJUVENATE if alone else 0.0)
@@ -117,17 +119,19 @@ class Config:
             )
 
     @classmethod
-    def from_dict(cls, values):
+    def from_dict(cls, values: Mapping[str, Any]) -> "Config":
         """Make a `Config` of a dict as stored in files; names of version 0.1 are read, too."""
         return cls(**{FORMER_FIELDS.get(name, name): value for name, value in values.items()})
 
     @classmethod
-    def paper(cls, particles=1000, landmarks=64, measurements=16, **changes):
+    def paper(
+        cls, particles: int = 1000, landmarks: int = 64, measurements: int = 16, **changes: Any
+    ) -> "Config":
         """Make the paper's `Config`: 2-D positions, prior proposal, likeliest match for each
         measurement, without exclusion, clutter or forgetting (section III-D).
         """
         # All rules, so that no later default changes the preset.
-        rules = dict(
+        rules: dict[str, Any] = dict(
             sensor="position",
             association="maximum_likelihood",
             proposal="prior",

@@ -13,6 +13,7 @@ file may hold only some of the names. Three tables may say what is learned, and 
 
 import math
 import tomllib
+from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from typing import NamedTuple
@@ -74,7 +75,7 @@ def _range(row, value):
     return good, words
 
 
-def load_params(path, base):
+def load_params(path: str | Path, base: Params) -> Params:
     """Load the `Params` of a file; names not in it keep their value of `base`.
 
     Raises `ValueError` naming file, parameter, value and what is allowed.
@@ -172,7 +173,12 @@ def _pair(path, part, name, value, params):
     return first, second
 
 
-def save_params(path, params, standard_errors=None, learning=None):
+def save_params(
+    path: str | Path,
+    params: Params,
+    standard_errors: Mapping[str, float] | None = None,
+    learning: Learning | None = None,
+) -> None:
     """Write `params` to a file atomically; `standard_errors`: a dict by name, or None.
 
     `learning`: a `Learning` whose names, bounds and priors are written, too, so that another fit

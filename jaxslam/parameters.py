@@ -5,9 +5,12 @@ learning, messages and the documentation's table are derived from it.
 """
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from jaxslam.config import SENSORS
+
+if TYPE_CHECKING:
+    from jaxslam.logs.log import Log
 
 MOTION, ALTERNATIVES = "motion", "alternatives"  # in `learned_by`, beside the sensors
 COMMAND_FLOOR = 0.002  # m/sqrt(s): the error of a commanded step grows with its length, not time
@@ -219,12 +222,12 @@ class Params(NamedTuple):
     existence_confirm: float
 
     @property
-    def growth(self):
+    def growth(self) -> float:
         """`landmark_extent` by its name of version 0.1."""
         return self.landmark_extent
 
     @property
-    def caution(self):
+    def caution(self) -> float:
         """`extra_bearing_noise` by its name of version 0.1."""
         return self.extra_bearing_noise
 
@@ -239,7 +242,7 @@ def learned_by(whose):
     return tuple(row.name for row in PARAMETERS if whose in row.learned_by)
 
 
-def default_params(sensor="range_bearing", log=None):
+def default_params(sensor: str = "range_bearing", log: "Log | None" = None) -> "Params":
     """Make the default `Params` of a sensor, with the odometry, mounting, view and noise that a
     log declares.
 

@@ -261,8 +261,10 @@ def planar(
 def main(argv=None):
     """Run one command (None: of the process's arguments) and return its exit code."""
     tokens = sys.argv[1:] if argv is None else argv
-    settings = {"exit_on_error": False, "print_error": False, "result_action": "return_value"}
-    return run_command(lambda: app(tokens, **settings), at_once=argv is None)
+    return run_command(
+        lambda: app(tokens, exit_on_error=False, print_error=False, result_action="return_value"),
+        at_once=argv is None,
+    )
 
 
 def _parse_counts(text):

@@ -122,8 +122,8 @@ class Log:
     mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)
     time_offset: float = 0.0
     noise: dict[str, float] = field(default_factory=dict)
-    start_pose: np.ndarray = (0.0, 0.0, 0.0)
-    start_cov: np.ndarray = ((0.0, 0.0, 0.0),) * 3
+    start_pose: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    start_cov: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
     truth: Truth | None = None
     plan: FloorPlan | None = None
     skipped: dict[str, int] = field(default_factory=dict)
@@ -147,7 +147,7 @@ class Log:
         return f"Log({self.name!r}: {rows}, {len(self.frame)} measurements)"
 
     @property
-    def start(self):
+    def start(self) -> int:
         """Stamp [ns] at which `start_pose` holds: the first odometry or frame."""
         return min(int(self.odometry_time[0]), int(self.frame_time[0]))
 
@@ -158,13 +158,13 @@ class Log:
 
         return fit_appearance_space(self)
 
-    def has(self, sensor):
+    def has(self, sensor: str) -> bool:
         """Whether the log can supply a sensor, one of `config.SENSORS`."""
         bearing, both = self.bearing is not None, self.range is not None  # a range needs a bearing
         supplies = {"position": self.has_points() or both, "range_bearing": both}
         return (supplies | {"bearing": bearing}).get(sensor, False)
 
-    def has_points(self):
+    def has_points(self) -> bool:
         """Whether any measurement has a point."""
         return self.point is not None and bool((~np.isnan(self.point)).any() or not len(self.frame))
 

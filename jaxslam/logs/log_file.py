@@ -23,7 +23,7 @@ MAX_DIMENSIONS = 4
 MAX_TEXT_BYTES = 1 << 16
 
 
-def save_log(path, log):
+def save_log(path: str | Path, log: Log) -> None:
     """Write a log to `path` (.npz) atomically: an interrupted write leaves the old file.
 
     Raises `ValueError` if it can't be written.
@@ -42,7 +42,7 @@ def save_log(path, log):
 
 def entries_of(log):
     """A log's arrays and numbers by the name of their entry."""
-    entries = {"schema": np.int64(SCHEMA)}
+    entries: dict = {"schema": np.int64(SCHEMA)}
     for part, prefix in ((log, ""), (log.truth, "truth/"), (log.plan, "plan/")):
         for item in fields(part) if part is not None else ():
             value = getattr(part, item.name)
@@ -53,7 +53,7 @@ def entries_of(log):
     return entries
 
 
-def load_log(path):
+def load_log(path: str | Path) -> Log:
     """Load the log of a `.npz` file, or the bundled one of that name (`lost-in-the-woods`).
 
     Raises `ValueError` naming the file and what is wrong with it.

@@ -27,7 +27,7 @@ class Odometry(NamedTuple):
     lever_var: np.ndarray
 
     @classmethod
-    def from_displacement(cls, dx, dy, dtheta, duration):
+    def from_displacement(cls, dx: float, dy: float, dtheta: float, duration: float) -> "Odometry":
         """`Odometry` of one interval from its displacement, driven along an arc.
 
         `dx`, `dy` [m]: in the robot's frame at the interval's start; `dtheta` [rad]: less than a
@@ -35,7 +35,8 @@ class Odometry(NamedTuple):
         `turn` instead, as `increments` does.
         """
         distance = np.hypot(dx, dy) / np.sinc(dtheta / (2 * np.pi))  # chord to arc
-        return cls(dx, dy, dtheta, distance, abs(dtheta), duration, 0.5, 1 / 12)
+        values = dx, dy, dtheta, distance, abs(dtheta), duration, 0.5, 1 / 12
+        return cls(*map(np.asarray, values))
 
 
 def increments(log):

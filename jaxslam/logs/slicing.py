@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from jaxslam.logs.log import Log
 from jaxslam.logs.odometry import held_velocities
 from jaxslam.logs.truth import truth_at
 
@@ -12,7 +13,7 @@ PER_ROW += ("identity", "descriptor")
 S = 10**9  # ns
 
 
-def cut(log, start=0.0, end=None):
+def cut(log: Log, start: float = 0.0, end: float | None = None) -> Log:
     """Cut a log to the frames in (start, end], times in s after `log.start`.
 
     `start` 0 includes a frame at 0; `end` None: the log's end. The cut holds the velocity that was
@@ -48,7 +49,7 @@ def cut(log, start=0.0, end=None):
     )
 
 
-def windows(log, seconds):
+def windows(log: Log, seconds: float) -> list[Log]:
     """Cut a log into a list of `Log`s of `seconds` each.
 
     The rest is a window if it is at least half as long. Windows without frames are left out.
@@ -65,7 +66,7 @@ def windows(log, seconds):
     return pieces
 
 
-def spaced(log, seconds):
+def spaced(log: Log, seconds: float) -> Log:
     """Keep only frames that are at least `seconds` apart (0: all), and all odometry.
 
     Errors of frames in quick succession are correlated, which a filter, and more so learning, takes

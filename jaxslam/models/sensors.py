@@ -15,7 +15,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
+from jaxslam.config import Config
 from jaxslam.models import geometry
 from jaxslam.models.geometry import direction, norm, wrap
 
@@ -45,7 +47,13 @@ class Measurements(NamedTuple):
     within: jax.Array | None = None
 
     @classmethod
-    def from_values(cls, values, config, cov=None, identity=None):
+    def from_values(
+        cls,
+        values: ArrayLike,
+        config: Config,
+        cov: ArrayLike | None = None,
+        identity: ArrayLike | None = None,
+    ) -> "Measurements":
         """`Measurements` of one frame from its n <= K measurements, with padding up to K.
 
         `values` [n, 2]: (range, bearing) or (x, y); for `bearing` [n]. `cov` [n, 3]: (xx, xy, yy),

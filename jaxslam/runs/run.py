@@ -2,7 +2,9 @@
 
 import dataclasses
 import time
+from collections.abc import Callable
 from contextlib import nullcontext
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +14,11 @@ from jaxslam.config import SENSORS, Config
 from jaxslam.filter import sharding
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.frames import frames_from_log
+from jaxslam.logs.log import Log
 from jaxslam.parameter_file import validate
-from jaxslam.parameters import default_params
+from jaxslam.parameters import Params, default_params
 from jaxslam.results.events import association_entropy
+from jaxslam.results.result import Result
 from jaxslam.runs import compiled
 from jaxslam.runs import memory as capacity
 from jaxslam.runs.assemble import (
@@ -33,8 +37,13 @@ from jaxslam.runs.compiled import (
 from jaxslam.smoother.genealogy import Tree, trace_lineage
 from jaxslam.smoother.rejuvenation import Rejuvenator
 
+if TYPE_CHECKING:
+    from jaxslam.runs.checkpoints import Checkpoints, FollowerCheckpoints
 
-def config_for(log, sensor=None, association="maximum_likelihood", **settings):
+
+def config_for(
+    log: Log, sensor: str | None = None, association: str = "maximum_likelihood", **settings: Any
+) -> Config:
     """A `Config` whose sensor and sizes fit the log; `settings` are further `Config` fields.
 
     Hidden bearings get the informed proposal unless told otherwise, and looks help to associate
@@ -52,7 +61,15 @@ def config_for(log, sensor=None, association="maximum_likelihood", **settings):
     return Config(sensor=sensor, association=association, **settings)
 
 
-def run(log, config=None, params=None, seed=0, progress=None, refine=True, checkpoints=None):
+def run(
+    log: Log,
+    config: Config | None = None,
+    params: Params | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int, str], None] | None = None,
+    refine: bool = True,
+    checkpoints: "Checkpoints | FollowerCheckpoints | None" = None,
+) -> Result:
     """Filter a whole log, and refine what it found.
 
     `config`: None for `config_for(log)`; `params`: None for `default_params`; `progress`: called

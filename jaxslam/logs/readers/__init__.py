@@ -5,9 +5,12 @@ formats, `mat5` MATLAB files. Nothing heavy is imported before a file is read: `
 --help` lists the formats.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from jaxslam.logs.log import Log
 
 
 class Format(NamedTuple):
@@ -25,7 +28,7 @@ class Format(NamedTuple):
     robots: bool = False
 
 
-def read(paths, robot=None):
+def read(paths: str | Path | Sequence[str | Path], robot: int | None = None) -> "Log":
     """Read the `Log` of a file, a folder or a list of files, in the first of `FORMATS` that fits.
 
     `robot`: number of the robot, where there are several. Raises `ValueError` naming the file and
