@@ -14,7 +14,7 @@ from jaxslam.config import SENSORS
 from jaxslam.parameters import PARAMETERS, default_params
 
 ROOT = Path(__file__).resolve().parents[1]
-MARKER = re.compile(r"^<!-- generated: ([\w-]+) ?([\w./]*) -->$", re.MULTILINE)
+MARKER = re.compile(r"^<!-- generated: ([\w-]+) ?([\w./,]*) -->$", re.MULTILINE)
 
 
 def on_page_markdown(markdown, **_):
@@ -24,14 +24,14 @@ def on_page_markdown(markdown, **_):
 
 def parameter_table(_=""):
     """A row for each of `PARAMETERS`: defaults by sensor, unit, range, likelihoods, meaning."""
-    head = ("Parameter", *(f"`{sensor}`" for sensor in SENSORS), "Unit", "Allowed", "Learned by")
+    head = ("Parameter", *SENSORS, "Unit", "Allowed", "Learned by")
     lines = [_row((*head, "Meaning")), "|---|" + "--:|" * len(SENSORS) + "---|" * 4]
     defaults = [default_params(sensor) for sensor in SENSORS]
     for row in PARAMETERS:
         values = (_number(getattr(params, row.name)) for params in defaults)
         former = row.former and f"in version 0.1 `{row.former}`"
         meaning = "; ".join(filter(None, (row.meaning, row.note, former)))
-        learned = ", ".join(f"`{name}`" if name in SENSORS else name for name in row.learned_by)
+        learned = "sensor" if row.learned_by == SENSORS else ", ".join(row.learned_by)
         lines.append(_row((f"`{row.name}`", *values, row.unit, _allowed(row), learned, meaning)))
     return "\n".join(lines)
 
@@ -60,19 +60,21 @@ def command_line(_=""):
 
     text = app.generate_docs(heading_level=1)
     text = text[text.index("\n## ", text.index("**Commands**")) :]
+    text = "\n".join(sorted(re.split(r"\n(?=## )", text)))
     text = re.sub(r", --no-[\w-]+", "", text)  # the program has no such options
-    text = re.sub(r"(jaxslam( [a-z]+)+?)\2 ", r"\1 ", text)
+    text = re.sub(r"jaxslam ((?:[a-z]+ )+)\1", r"jaxslam \1", text)
     example = re.compile(r"^Example: (jaxslam .*(?:\n(?!\n|\*\*).+)*)", re.MULTILINE)
     text = example.sub(lambda found: f"```sh\n{' '.join(found[1].split())}\n```", text)
     return text.replace("**Parameters**:", "**Options**:")
 
 
-def public_names(package=""):
-    """A table of `jaxslam`'s public names defined in that sub-package (all of them if empty)."""
-    lines = ["| Name | |", "|---|---|"]
+def public_names(packages="jaxslam"):
+    """A table of `jaxslam`'s public names that are defined in these modules or sub-packages."""
+    packages = tuple(f"{package}." for package in packages.split(","))
+    lines = ["| Name | Meaning |", "|---|---|"]
     for name, where in {**jaxslam._WHERE, **jaxslam._MODULES}.items():
         module = f"jaxslam.{where}"
-        if not f"{module}.".startswith(f"{package or 'jaxslam'}."):
+        if not f"{module}.".startswith(packages):
             continue
         target = module if name in jaxslam._MODULES else f"{module}.{_defined(name)}"
         lines.append(_row((f"[`jaxslam.{name}`][{target}]", _first_sentence(module, target))))
