@@ -1,4 +1,4 @@
-"""The loop over `init` and `step` in docs/python.md runs, and its helpers pad and convert."""
+"""The loop over `init` and `step` in docs/how-to/step-by-step.md runs, and its helpers pad and convert."""
 
 import re
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 
 import jaxslam
 
-PAGE = Path(__file__).resolve().parents[2] / "docs/python.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs/how-to/step-by-step.md"
 POSTS = np.array([[2.0, 1.5], [4.0, -1.0], [6.0, 2.0]])
 
 
