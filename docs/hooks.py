@@ -95,13 +95,15 @@ def _source(module):
 
 
 def modules(name):
-    """A directive of mkdocstrings for the module, or for every module of the package."""
+    """Directives of mkdocstrings: the module, or the package's modules, public ones first."""
     folder = ROOT / name.replace(".", "/")
     if not folder.is_dir():
         return f"::: {name}\n"
-    paths = (path for path in sorted(folder.rglob("*.py")) if ast.parse(path.read_text()).body[1:])
-    names = (".".join(path.relative_to(ROOT).with_suffix("").parts) for path in paths)
-    return "\n".join(f"::: {module.removesuffix('.__init__')}\n" for module in names)
+    public = {f"jaxslam.{where.partition(':')[0]}" for where in jaxslam._PUBLIC.values()}
+    paths = (path for path in folder.rglob("*.py") if ast.parse(path.read_text("utf-8")).body[1:])
+    found = (".".join(path.relative_to(ROOT).with_suffix("").parts) for path in paths)
+    found = [module.removesuffix(".__init__") for module in found]
+    return "\n".join(f"::: {m}\n" for m in sorted(found, key=lambda m: (m not in public, m)))
 
 
 def root_file(name):
