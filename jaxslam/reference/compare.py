@@ -140,7 +140,7 @@ def agreement(log, config, params=None, seed=0, steps=None, double=True, progres
         seconds_baseline=spent,
         seconds_filter=ran,
         compile_seconds=compiled,
-        map_baseline=_baseline_map(reference, params, config, data.identities, origin),
+        map_baseline=_map_of_best(reference, params, config, data.identities, origin),
     )
 
 
@@ -193,7 +193,7 @@ class _Trace(NamedTuple):
 
 
 @partial(jax.jit, static_argnames="config")
-def _steps(key, state, odometry, measurements, params, config):
+def _scan_steps(key, state, odometry, measurements, params, config):
     def body(state, frame):
         state, info = fastslam.step(key, state, *frame, params, config)
         kept = state.pose, state.log_weight, info.ancestors, info.landmark_id, info.estimate.mean
@@ -208,7 +208,7 @@ def _run_filter(data, config, params, seed, start, log):
     state = fastslam.init(config, key, start, log.start_cov)
     given = jax.tree.map(jnp.asarray, (data.odometry, data.measurements, params))
     begin = time.perf_counter()
-    steps = _steps.lower(key, state, *given, config).compile()
+    steps = _scan_steps.lower(key, state, *given, config).compile()
     compiled = time.perf_counter()
     jax.block_until_ready(steps(key, state, *given))  # to warm up
     begin, compiled = time.perf_counter(), compiled - begin
@@ -222,7 +222,7 @@ def _run_filter(data, config, params, seed, start, log):
     return *host, compiled, ran
 
 
-def _baseline_map(reference, params, config, identities, origin):
+def _map_of_best(reference, params, config, identities, origin):
     """`PointMap` of the best particle's landmarks that are confirmed and have a depth."""
     # After resampling all weights are equal: the best particle lives on in its first child.
     heir = int(np.argmax(reference.ancestors[-1] == reference.best[-1]))

@@ -120,7 +120,7 @@ def test_the_baselines_map_is_what_its_best_particle_is_sure_of():
     def found(sensor, **rules):
         config = Config(sensor=sensor, **rules)
         given = reference, params, config, np.array([40, 41, 42]), np.array([10.0, 20, 0])
-        return [column.tolist() for column in compare._baseline_map(*given)]
+        return [column.tolist() for column in compare._map_of_best(*given)]
 
     assert found("position") == [[[10.0, 20.5], [10.0, 20.5]], [40, -1]]
     assert len(found("position", forgetting=False)[0]) == 3
