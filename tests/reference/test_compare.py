@@ -38,8 +38,8 @@ def assert_agree(log, config):
     assert found.same == found.steps == STEPS
     assert max(found.pose, found.log_weight, found.landmarks) <= 1e-9
     assert found.resampled >= 10
-    assert found.born >= 5
-    assert found.freed >= 1 or not config.forgetting
+    assert found.begun >= 5
+    assert found.forgotten >= 1 or not config.forgetting
     assert jnp.ones(1).dtype == jnp.float32  # float64 was not left switched on
     return found
 
@@ -70,7 +70,7 @@ def test_baseline_and_filter_agree_on_points_that_rest_on_odometry(woods):
 
 def test_baseline_and_filter_agree_on_the_papers_rules(woods):
     found = assert_agree(woods, Config.paper(**SIZES))
-    assert found.freed == found.clutter == 0
+    assert found.forgotten == found.clutter == 0
 
 
 def small(steps=12):
