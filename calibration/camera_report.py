@@ -1,4 +1,4 @@
-"""What a camera calibration found: a text for the terminal and a picture."""
+"""Report of a camera calibration: a text for the terminal, and a picture."""
 
 from pathlib import Path
 
@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 from calibration.coverage import RINGS, SECTORS
 from jaxslam.plotting import FILTER, LANDMARK, PLAN, RECKONING, STYLE, TRUE, write_figure
 
-LONGEST = 0.06  # of the image's width: the arrow of the largest residual but outliers
+LONGEST = 0.06  # of the image's width, the arrow of the largest residual without outliers
 
 
 def text(found):
-    """Residuals of every image, what was rejected, coverage, bearing uncertainty, warnings."""
+    """Residuals of every image, rejected images, coverage, bearing uncertainty, and warnings."""
     camera = found.camera
     model = camera.model + (f" of order {found.order}" if found.order else "")
     corners = len(found.corners.pixel)
@@ -33,7 +33,7 @@ def text(found):
         f"bearing uncertainty (1 sigma): {found.bearings.rms_deg:.3f}° RMS,"
         f" {found.bearings.max_deg:.3f}° at most; elevations covered: {low:.1f}° to {high:.1f}°"
     ]
-    return "\n".join(lines + [f"warning: {told}" for told in found.warnings])
+    return "\n".join(lines + [f"warning: {warning}" for warning in found.warnings])
 
 
 def _residuals(found):
@@ -47,19 +47,19 @@ def _residuals(found):
 
 
 def _rejected(found):
-    lines = [f"{found.again} outlier corners were found again"] if found.again else []
+    lines = [f"{found.again} outlier corners were localised again"] if found.again else []
     lines += [
-        f"outlier left aside: {name}, corner {index}: {distance:.1f} px"
+        f"outlier excluded: {name}, corner {index}: {distance:.1f} px"
         for name, index, distance in found.outliers
     ]
     return lines + [f"rejected: {name}: {reason}" for name, reason in found.rejected]
 
 
 def _orders(found):
-    lines = ["order    RMS [px]  on boards left out"]
-    for order, (rms, left_out) in found.scores.items():
-        told = f"{left_out:.4f}" if np.isfinite(left_out) else "too few boards"
-        lines.append(f"{order:7}  {rms:8.4f}  {told}{' <' * (order == found.order)}")
+    lines = ["order    RMS [px]  on held-out boards"]
+    for order, (rms, held_out) in found.scores.items():
+        score = f"{held_out:.4f}" if np.isfinite(held_out) else "too few boards"
+        lines.append(f"{order:7}  {rms:8.4f}  {score}{' <' * (order == found.order)}")
     return lines
 
 
@@ -105,7 +105,7 @@ def _draw_residuals(axes, found):
         scale=scale, width=0.0018, headwidth=4,
     )  # fmt: skip
     if not good.all():
-        axes.plot(*pixel[~good].T, "x", color=LANDMARK, label="outlier left aside")
+        axes.plot(*pixel[~good].T, "x", color=LANDMARK, label="outlier, excluded")
     axes.legend(loc="lower right")
 
 
@@ -122,7 +122,7 @@ def _draw_coverage(axes, found):
     for b in range(found.corners.boards):
         own = found.corners.pixel[found.corners.board == b]
         axes.plot(*own.T, ".", ms=4, color=colours(b / max(found.corners.boards - 1, 1)))
-    ring, sector = np.nonzero(cover.count == 0)  # where a board is still wanted
+    ring, sector = np.nonzero(cover.count == 0)  # where boards are missing
     rho = (ring + 0.5) * cover.radius[1] / RINGS
     around = -np.pi + (sector + 0.5) * 2 * np.pi / SECTORS
     spots = centre + np.stack([rho * np.cos(around), rho * np.sin(around)], 1)
@@ -131,7 +131,7 @@ def _draw_coverage(axes, found):
 
 
 def _draw_radial(axes, found):
-    """Angle from the axis over radius, and the standard deviations of both angles."""
+    """Draw the angle from the axis over radius, and standard deviations of both angles."""
     camera, (low, high) = found.camera, found.coverage.radius
     rho = np.linspace(0, max(camera.size) / 2, 200)
     ray = camera.ray(camera.params[:2] + np.stack([rho, 0 * rho], 1))
@@ -156,10 +156,10 @@ def _draw_radial(axes, found):
 
 
 def _draw_bearings(figure, axes, found):
-    known = found.bearings
-    title = f"σ of azimuth: {known.rms_deg:.3f}° RMS, {known.max_deg:.3f}° at most"
+    bearings = found.bearings
+    title = f"σ of azimuth: {bearings.rms_deg:.3f}° RMS, {bearings.max_deg:.3f}° at most"
     _image_axes(axes, found.camera, title)
-    x, y = np.moveaxis(np.concatenate([known.pixel, known.pixel[:, :1]], 1), -1, 0)
-    sigma = np.degrees(known.sigma[:-1])  # of a cell's first corner
+    x, y = np.moveaxis(np.concatenate([bearings.pixel, bearings.pixel[:, :1]], 1), -1, 0)
+    sigma = np.degrees(bearings.sigma[:-1])  # of a cell's first corner
     mesh = axes.pcolormesh(x, y, sigma, cmap="viridis", vmin=0)
     figure.colorbar(mesh, ax=axes, label="σ of azimuth [°]", shrink=0.8)
