@@ -5,7 +5,16 @@ from typing import Literal
 
 from cyclopts import App
 
-from jaxslam.cli.common import LogName, OutLog, Overwrite, Seed, bar, check_new, option, warn
+from jaxslam.cli.common import (
+    LogName,
+    OutLog,
+    Overwrite,
+    Seed,
+    check_new,
+    option,
+    progress_bar,
+    warn,
+)
 
 calibrate = App(name="calibrate", help="Fit a camera, its tilt, or a sensor's errors.")
 
@@ -54,7 +63,7 @@ def camera(
         raise ValueError("calibrate camera: a folder, or files, of images are needed")
     check_new(out, overwrite, "a camera", ".toml")
     check_new(report, overwrite, "a picture", ".png")
-    with bar("finding corners") as progress:
+    with progress_bar("finding corners") as progress:
         found = calibrate_camera(
             list(images) if len(images) > 1 else images[0],
             _parse_board(board),
@@ -96,7 +105,7 @@ def tilt(
     if out:
         check_new(out, overwrite, "a camera", ".toml")
     known = load_camera(camera, mirror, lens)
-    with bar("looking for lines") as progress:
+    with progress_bar("looking for lines") as progress:
         found = find_tilt(Images(images), known, progress=progress)
     print(describe(found))
     if out:
@@ -137,7 +146,7 @@ def sensor(
         check_new(figure, overwrite, "a picture", ".png")
         if not drive.has("position") or drive.point is None:
             raise ValueError(f"{log}: has no points to draw; leave --figure out, or triangulate")
-    with bar("fitting"):
+    with progress_bar("fitting"):
         report = sensor_report.calibrate_sensor(drive)
     print(sensor_report.text(report))
     base = default_params("position" if report.models else "bearing", drive)
@@ -185,7 +194,7 @@ def extract(
     known = load_camera(camera, mirror, lens)
     robot = load_params(params, default_params("position")) if params else None
     try:
-        with bar("extracting lines") as progress:
+        with progress_bar("extracting lines") as progress:
             log = run_extract(
                 images, known, odometry, out, truth=truth, params=robot, overlay=overlay,
                 overwrite=overwrite, progress=progress,
@@ -212,7 +221,7 @@ def triangulate(
     from jaxslam.vision.log_triangulation import triangulate_log
 
     check_new(out, overwrite)
-    with bar("triangulating") as progress:
+    with progress_bar("triangulating") as progress:
         given = load_log(log)
         robot = load_params(params, default_params("position", given)) if params else None
         found = triangulate_log(given, robot, progress=progress)
@@ -243,7 +252,7 @@ def room(
     """
     from jaxslam.simulation.room.render import render_room
 
-    with bar("rendering") as progress:
+    with progress_bar("rendering") as progress:
         frames = render_room(
             out,
             seed=seed,

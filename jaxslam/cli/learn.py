@@ -19,10 +19,10 @@ from jaxslam.cli.common import (
     Sensor,
     Start,
     at_least,
-    bar,
     check_new,
     note,
     option,
+    progress_bar,
     warn,
 )
 from jaxslam.config import ASSOCIATIONS
@@ -84,7 +84,7 @@ def learn(
         raise ValueError("--compare-models needs --held-out logs to compare by")
     _check_apart(logs, (start, end), held_out, (held_out_start, held_out_end))
     _use_all_cores()
-    with bar("reading"):
+    with progress_bar("reading"):
         known = association == "known"
         train = _windows(logs, start, end, window, spacing, known)
         judges = _windows(held_out, held_out_start, held_out_end, window, spacing, known)
@@ -189,9 +189,7 @@ def _config(parts, sensor, association, particles, landmarks):
     )
     dropped = {}
     for part in parts:
-        found = frames_from_log(
-            part, config.sensor, config.measurements, None, association == "known"
-        )
+        found = frames_from_log(part, config)
         for why, count in found.dropped.items():
             dropped[why] = dropped.get(why, 0) + count
     return config, dropped
@@ -273,7 +271,7 @@ def _without_clip_warning():
 @contextmanager
 def _progress_printer(what):
     """A function for the progress of a fit: a bar, or a line now and then."""
-    with bar(what, compiles=True) as show:
+    with progress_bar(what, compiles=True) as show:
         if show:
             show(0, None)
         else:
@@ -296,12 +294,12 @@ def _assess(fit, train, judges, seed):
     from jaxslam.learning.report import Judged
     from jaxslam.learning.uncertainty import assess, improve
 
-    with bar("standard errors", compiles=True):
+    with progress_bar("standard errors", compiles=True):
         errors = assess(fit, train, seed=seed + 1)
     fit = improve(fit, errors)
     if not judges:
         return fit, errors, None
-    with bar("judging", compiles=True):
+    with progress_bar("judging", compiles=True):
         fresh = seed + 7919
         both = (evidence(judges, fit.config, p, FRESH, fresh) for p in (fit.start, fit.params))
         return fit, errors, Judged(*both)
@@ -316,7 +314,7 @@ def _write(fit, errors, task, files):
     # From the free scale and back, a value at its bound may be a rounding beyond it.
     at_bound = {n: min(max(getattr(fit.params, n), a), b) for n, (a, b) in task.bounds.items()}
     params = fit.params._replace(**at_bound)
-    with bar("writing"):
+    with progress_bar("writing"):
         save_params(files["params"], params, standard, task._replace(params=params))
         learn_report.save_csv(files["csv"], fit)
         learn_report.save_figure(learn_report.draw_learning(fit, errors), files["figure"])
@@ -327,7 +325,7 @@ def _draw_surface(train, fit, errors, pair, path, seed):
     from jaxslam.learning import report as learn_report
     from jaxslam.learning import surface
 
-    with bar("surface", compiles=True) as progress:
+    with progress_bar("surface", compiles=True) as progress:
         found = surface.surface(train, fit, errors, pair, seed=seed + 2, progress=progress)
     learn_report.save_figure(surface.draw_surface(found, fit, errors), path)
     print(path)
@@ -355,7 +353,7 @@ def _models(train, judges, fit, seeds, steps, seed):
     """Print which sensor error model the held-out logs prefer; whether something went wrong."""
     from jaxslam.learning import error_models
 
-    with bar("error models", compiles=True) as progress, _without_clip_warning():
+    with progress_bar("error models", compiles=True) as progress, _without_clip_warning():
         rows = error_models.compare(
             train, judges, fit.config, fit.params, fit.names, seeds, steps, seed, progress
         )

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.logs.appearance_space import fit_appearance_space
+from jaxslam.config import SENSORS
 from jaxslam.logs.odometry import Odometry, increments
 from jaxslam.models.sensors import Measurements
 from jaxslam.parameters import default_params
@@ -23,17 +23,17 @@ class Frames(NamedTuple):
     dropped: dict[str, int]
 
 
-def frames_from_log(log, sensor, measurements=None, params=None, known=False, descriptors=0):
-    """`Frames` of a log for one sensor.
+def frames_from_log(log, config, params=None):
+    """`Frames` of a log for a `Config`: its sensor, K = `measurements`, `association`, `descriptors`.
 
-    `measurements`: slots per frame (None: as many as the fullest frame needs); beyond them the
-    farthest are dropped, or the last where there is no range. `params` gives the noise when
-    positions are made of ranges and bearings. `known`: hand over the measured identities; otherwise
-    they are hidden. `descriptors`: coordinates of their looks handed over. Raises
-    `ValueError` when the log can't supply what is asked.
+    Of a frame with more than K measurements the farthest are dropped, or the last where there is no
+    range. Identities are handed over only to association `known`. `params` (None: `default_params`)
+    give the noise of positions computed from ranges and bearings. Raises `ValueError` when the log
+    lacks the sensor, the identities or the descriptors.
     """
+    sensor, known = config.sensor, config.association == "known"
     if not log.has(sensor):
-        has = [name for name in ("position", "range_bearing", "bearing") if log.has(name)]
+        has = [name for name in SENSORS if log.has(name)]
         raise ValueError(
             f"{log.name}: sensor {sensor!r} is not in this log; it has {' '.join(has)}"
         )
@@ -45,9 +45,9 @@ def frames_from_log(log, sensor, measurements=None, params=None, known=False, de
     if known:
         rows = _with_identity(log, rows, dropped)
         identities, identity[rows] = np.unique(log.identity[rows], return_inverse=True)
-    rows, slot, slots = _slots(log, rows, reach, measurements, dropped)
-    row = np.full((len(log.frame_time), slots), -1)
-    row[log.frame[rows], slot] = rows
+    rows, column = _place(log, rows, reach, config.measurements, dropped)
+    row = np.full((len(log.frame_time), config.measurements), -1)
+    row[log.frame[rows], column] = rows
     # Padding, row -1, reads the last row, which is appended here.
     return Frames(
         time=log.frame_time,
@@ -59,7 +59,7 @@ def frames_from_log(log, sensor, measurements=None, params=None, known=False, de
             identity=np.append(identity, -1)[row].astype(np.int32),
             valid=row >= 0,
             active=np.ones(len(row), bool),
-            **_appearance_columns(log, descriptors, row),
+            **_appearance_columns(log, config.descriptors, row),
         ),
         identities=identities,
         row=row,
@@ -89,7 +89,7 @@ def _appearance_columns(log, size, row):
     """`Measurements.descriptor` [T, K, J] and `within` [T, J] of the slots' rows."""
     if not size:
         return {}
-    found = fit_appearance_space(log)
+    found = log.appearance_space
     if len(found.within) < size:
         raise ValueError(
             f"{log.name}: {size} descriptors are asked for, but {len(found.within)} tell landmarks "
@@ -118,15 +118,13 @@ def _with_identity(log, rows, dropped):
     return rows[first]
 
 
-def _slots(log, rows, reach, slots, dropped):
-    """The rows that find a slot, in the log's order, their slots, and the number of slots."""
-    if slots is None:
-        slots = max(1, np.bincount(log.frame[rows], minlength=1).max())
+def _place(log, rows, reach, most, dropped):
+    """The `most` nearest rows of every frame, in the log's order, and their places in the frame."""
     rank = _rank(log.frame[rows]) if reach is None else _rank(log.frame[rows], reach[rows])
-    keep = rank < slots
+    keep = rank < most
     _count(dropped, "no measurement slot", int((~keep).sum()))
     rows = rows[keep]
-    return rows, _rank(log.frame[rows]), int(slots)
+    return rows, _rank(log.frame[rows])
 
 
 def _rank(frame, order=None):

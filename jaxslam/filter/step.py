@@ -14,7 +14,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
+from jaxslam.config import Config
 from jaxslam.filter import (
     appearance,
     blocks,
@@ -32,7 +34,10 @@ from jaxslam.filter.landmarks import Landmarks
 from jaxslam.filter.lazy_resampling import Ancestry
 from jaxslam.filter.weights import Estimate, estimate_pose, weigh
 from jaxslam.filter.xla import barrier
+from jaxslam.logs.odometry import Odometry
 from jaxslam.models.geometry import wrap
+from jaxslam.models.sensors import Measurements
+from jaxslam.parameters import Params
 
 
 class State(NamedTuple):
@@ -79,7 +84,13 @@ class Info(NamedTuple):
     degenerate: jax.Array
 
 
-def init(config, key, pose=(0.0, 0.0, 0.0), cov=None, landmarks_given=None):
+def init(
+    config: Config,
+    key: jax.Array,
+    pose: ArrayLike = (0.0, 0.0, 0.0),
+    cov: ArrayLike | None = None,
+    landmarks_given: tuple[ArrayLike, ...] | None = None,
+) -> State:
     """`State` before the first step: poses drawn from N(pose, cov), map empty or given.
 
     `pose` (x, y, heading), `cov` [3, 3] (None: known exactly). `landmarks_given`: mean [2, L] and
@@ -183,7 +194,14 @@ def layout(state):
 
 
 @partial(jax.jit, static_argnames="config")
-def step(key, state, odometry, measurements, params, config):
+def step(
+    key: jax.Array,
+    state: State,
+    odometry: Odometry,
+    measurements: Measurements,
+    params: Params,
+    config: Config,
+) -> tuple[State, Info]:
     """One step: move, associate and weigh, update, resample. Returns (State, Info)."""
     given = draw_random_numbers(key, state.step, config), state, odometry, measurements, params
     if config.devices == 1:

@@ -99,8 +99,7 @@ def _without_points(log):
 
 def _ranges(log, config, params):
     """Ranges [n] of the measurements that find a slot (ones, where none was measured)."""
-    known = config.association == "known"
-    row = frames_from_log(log, config.sensor, config.measurements, params, known).row
+    row = frames_from_log(log, config, params).row
     ranges = np.ones(len(log.frame)) if log.range is None else log.range
     return ranges[row[row >= 0]]
 

@@ -15,6 +15,7 @@ that of MOP, Tan, Hooker and Ionides 2024). docs/gradients.md says when to distr
 
 import dataclasses
 import warnings
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -22,10 +23,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.config import Config
 from jaxslam.filter import blocks, resampling
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.association import CLUTTER, NEW
 from jaxslam.filter.frames import frames_from_log
+from jaxslam.logs.log import Log
 from jaxslam.logs.odometry import Odometry
 from jaxslam.models import motion
 from jaxslam.models.sensors import Measurements
@@ -77,9 +80,7 @@ def data_from_log(log, config, params=None, steps=None):
     Places are shifted so that the start is near the origin; float32 has 7 digits. Raises
     `ValueError` when the log can't supply what the configuration asks or has more steps.
     """
-    made = frames_from_log(
-        log, config.sensor, config.measurements, params, config.association == "known"
-    )
+    made = frames_from_log(log, dataclasses.replace(config, descriptors=0), params)
     total = len(made.time)
     steps = total if steps is None else steps
     if steps < total:
@@ -95,7 +96,14 @@ def data_from_log(log, config, params=None, steps=None):
     return Data(start, jnp.asarray(log.start_cov, real), *arrays)
 
 
-def log_likelihood(params, log, key, config, estimator="fisher", discount=DISCOUNT):
+def log_likelihood(
+    params: Params,
+    log: Log | Data,
+    key: jax.Array,
+    config: Config,
+    estimator: str = "fisher",
+    discount: float | jax.Array = DISCOUNT,
+) -> jax.Array:
     """Estimate of the log likelihood of a `Log` or `Data`, with a derivative by `params`.
 
     `jax.grad` gives the `estimator` chosen, for `Params` or any values put into them. It is no
@@ -110,7 +118,15 @@ def log_likelihood(params, log, key, config, estimator="fisher", discount=DISCOU
     return _differentiable(config, estimator, numbers, discount, data, key)
 
 
-def score(params, log, key, config, names, estimator="fisher", discount=DISCOUNT):
+def score(
+    params: Params,
+    log: Log | Data,
+    key: jax.Array,
+    config: Config,
+    names: Sequence[str],
+    estimator: str = "fisher",
+    discount: float = DISCOUNT,
+) -> Score:
     """`Score` of a `Log` or `Data` by the parameters `names`, of which `learnable` has the list.
 
     `estimator`: `fisher`, along frozen paths; with `discount` 1 its expectation, weighted with the

@@ -3,6 +3,7 @@
 The heading drifts while the robot translates (`err_drift`), then it rotates (`err_rot`). An
 interval of many small steps keeps the direction of its chord, and its covariance is that of the
 many steps: heading noise that arose early displaces the end sideways, by the lever that was left.
+`logs/odometry.py:moments` has the same moments in NumPy.
 """
 
 from typing import NamedTuple

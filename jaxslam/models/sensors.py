@@ -14,7 +14,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
 
+from jaxslam.config import Config
 from jaxslam.models import geometry
 from jaxslam.models.geometry import direction, norm, wrap
 
@@ -42,6 +45,32 @@ class Measurements(NamedTuple):
     scale: jax.Array | None = None
     descriptor: jax.Array | None = None
     within: jax.Array | None = None
+
+    @classmethod
+    def from_values(
+        cls,
+        values: ArrayLike,
+        config: Config,
+        cov: ArrayLike | None = None,
+        identity: ArrayLike | None = None,
+    ) -> "Measurements":
+        """`Measurements` of one frame from its n <= K measurements, with padding up to K.
+
+        `values` [n, 2]: (range, bearing) or (x, y); for `bearing` [n]. `cov` [n, 3]: (xx, xy, yy),
+        for `position`. `identity` [n]: from 0, for known association. Raises `ValueError` for
+        more than `config.measurements` values or arrays of other shapes.
+        """
+        values = np.asarray(values, float)
+        n, size = len(values), config.measurements
+        if n > size:
+            raise ValueError(f"values: {n} are more than Config.measurements, {size}")
+        if config.sensor == "bearing":
+            values = np.column_stack([values, np.zeros(n)])
+        padded = np.zeros((size, 2)), np.zeros((size, 3)), np.full(size, -1, np.int32)
+        for array, given in zip(padded, (values, cov, identity), strict=True):
+            if given is not None:
+                array[:n] = given
+        return cls(*padded, valid=np.arange(size) < n, active=np.array(True))
 
 
 class Prediction(NamedTuple):

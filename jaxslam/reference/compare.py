@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.frames import frames_from_log
+from jaxslam.logs.slicing import select_frames
 from jaxslam.logs.truth import truth_at, wrap
 from jaxslam.models import geometry
 from jaxslam.parameters import Params, default_params
@@ -109,9 +110,7 @@ def agreement(log, config, params=None, seed=0, steps=None, double=True, progres
     params = Params(*map(float, params))
     if steps is not None:
         log = select_frames(log, np.arange(min(steps, len(log.frame_time))))
-    data = frames_from_log(
-        log, config.sensor, config.measurements, params, config.association == "known"
-    )
+    data = frames_from_log(log, config, params)
     if progress:
         progress(0, len(data.time))
     # The runner's local origin: float32 has 7 digits.
@@ -140,25 +139,6 @@ def agreement(log, config, params=None, seed=0, steps=None, double=True, progres
         seconds_filter=ran,
         compile_seconds=compiled,
         map_baseline=_baseline_map(reference, params, config, data.identities, origin),
-    )
-
-
-def select_frames(log, kept):
-    """The log with only these frames (increasing numbers [F]): a slower sensor, the same drive."""
-    number = np.full(len(log.frame_time), -1)
-    number[kept] = np.arange(len(kept))
-    rows = number[log.frame] >= 0
-    columns = ("bearing", "bearing_sigma", "range", "point", "point_cov", "point_baseline")
-    columns += ("identity", "descriptor")
-    truth = log.truth
-    if truth is not None and truth.identity is not None:
-        truth = dataclasses.replace(truth, identity=truth.identity[rows])
-    return dataclasses.replace(
-        log,
-        frame_time=log.frame_time[kept],
-        frame=number[log.frame[rows]],
-        truth=truth,
-        **{n: getattr(log, n)[rows] for n in columns if getattr(log, n) is not None},
     )
 
 

@@ -18,7 +18,7 @@ from jaxslam.results.run_folder import COLUMNS, FILE_NAMES, LOOKING_BACK, MAYBE
 from jaxslam.smoother.genealogy import Ancestral, Lineage
 
 
-def load_result(directory, log=None):
+def load_result(directory: str | Path, log: str | Path | None = None) -> Result:
     """The `Result` saved in a run's folder. `log`: where its log is now, if it was moved.
 
     Raises `ValueError` if a file is missing or broken, or if the log isn't the run's.
@@ -47,11 +47,13 @@ def load_result(directory, log=None):
         ) from None
     except (OSError, KeyError, TypeError, ValueError, EOFError, BadZipFile, zlib.error) as error:
         raise ValueError(f"{directory}: a broken run's folder ({error}); run it again") from error
-    log = _find_log(directory, source) if log is None else load_log(log)
-    if not np.isin(columns["time"], log.frame_time).all():
-        raise ValueError(f"{directory}: {log.name} is not the log of this run (frame times differ)")
+    used = _find_log(directory, source) if log is None else load_log(log)
+    if not np.isin(columns["time"], used.frame_time).all():
+        raise ValueError(
+            f"{directory}: {used.name} is not the log of this run (frame times differ)"
+        )
     return Result(
-        log=log,
+        log=used,
         config=config,
         params=params,
         seed=seed,

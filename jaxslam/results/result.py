@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -82,12 +83,12 @@ class Result:
     entropy: np.ndarray | None = None
 
     @property
-    def match(self):
+    def match(self) -> np.ndarray:
         """`landmark_id` by its name of version 0.1."""
         return self.landmark_id
 
     @property
-    def landmarks_refined(self):
+    def landmarks_refined(self) -> MapEstimate | None:
         """The refined map, or None."""
         found = self.refined
         if found is None:
@@ -95,12 +96,12 @@ class Result:
         return MapEstimate(found.id, found.mean, found.landmark_cov, found.n, found.identity)
 
     @property
-    def log_likelihood(self):
+    def log_likelihood(self) -> float:
         """Log evidence of the whole log, nats."""
         return float(np.sum(self.log_evidence, dtype=float))
 
     @cached_property
-    def flags(self):
+    def flags(self) -> list[str]:
         """One line for everything that was lost or went wrong; empty when nothing did."""
         lines = [f"{count} measurements left out: {why}" for why, count in self.dropped.items()]
         lines += [
@@ -126,7 +127,7 @@ class Result:
         return lines
 
     @cached_property
-    def advice(self):
+    def advice(self) -> list[str]:
         """One line for everything that is no fault but should be known."""
         return self._shared_past + self._failed + self._warped
 
@@ -175,7 +176,9 @@ class Result:
             "the path): the ancestral covariance says nothing about it"
         ]
 
-    def save(self, directory, overwrite=False, log_source=None):
+    def save(
+        self, directory: str | Path, overwrite: bool = False, log_source: str | None = None
+    ) -> None:
         """Write the run's folder (`report.save`); without a `log_source` the log is copied too."""
         from jaxslam.results import run_folder  # here: it brings matplotlib
 

@@ -238,7 +238,7 @@ def _write_files(result, folder, source, figures=True):
     if source is None:
         save_log(folder / "log.npz", result.log)
         source = "log.npz"
-    columns = {name: np.asarray(getattr(result, name)) for name in COLUMNS}
+    columns: dict = {name: np.asarray(getattr(result, name)) for name in COLUMNS}
     tables = {"map": result.landmarks} | {name: getattr(result, name) for name in LOOKING_BACK}
     for name, table in tables.items():
         if table is not None:

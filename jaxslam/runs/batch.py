@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.files import fsync_all, move_folder, temporary_sibling
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.filter.sharding import map_over_devices
 from jaxslam.parameter_file import validate
 from jaxslam.parameters import Params
@@ -140,7 +141,7 @@ def _run_in_turn(log, config, todo, progress, refine):
 
 def _run_together(log, config, group, count, shared_by, steps, refine):
     """The compiled steps (None: compile them), and results of the first `count` tasks."""
-    data = [runner.frames_of(log, config, task.params) for task in group]
+    data = [frames_from_log(log, config, task.params) for task in group]
     params = [jax.tree.map(jnp.asarray, task.params) for task in group]
     keys = [jax.random.key(task.seed) for task in group]
     states = [runner.initial_state(log, config, key) for key in keys]

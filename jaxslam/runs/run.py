@@ -2,20 +2,23 @@
 
 import dataclasses
 import time
+from collections.abc import Callable
 from contextlib import nullcontext
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.config import Config
+from jaxslam.config import SENSORS, Config
 from jaxslam.filter import sharding
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.frames import frames_from_log
-from jaxslam.logs.appearance_space import fit_appearance_space
+from jaxslam.logs.log import Log
 from jaxslam.parameter_file import validate
-from jaxslam.parameters import default_params
+from jaxslam.parameters import Params, default_params
 from jaxslam.results.events import association_entropy
+from jaxslam.results.result import Result
 from jaxslam.runs import compiled
 from jaxslam.runs import memory as capacity
 from jaxslam.runs.assemble import (
@@ -34,26 +37,39 @@ from jaxslam.runs.compiled import (
 from jaxslam.smoother.genealogy import Tree, trace_lineage
 from jaxslam.smoother.rejuvenation import Rejuvenator
 
+if TYPE_CHECKING:
+    from jaxslam.runs.checkpoints import Checkpoints, FollowerCheckpoints
 
-def config_for(log, sensor=None, association="maximum_likelihood", **settings):
+
+def config_for(
+    log: Log, sensor: str | None = None, association: str = "maximum_likelihood", **settings: Any
+) -> Config:
     """A `Config` whose sensor and sizes fit the log; `settings` are further `Config` fields.
 
     Hidden bearings get the informed proposal unless told otherwise, and looks help to associate
     them as far as the log's descriptors tell landmarks apart.
     """
     if sensor is None:
-        sensor = next(s for s in ("range_bearing", "position", "bearing") if log.has(s))
+        sensor = next(s for s in SENSORS if log.has(s))
     settings.setdefault("measurements", max(1, int(np.bincount(log.frame, minlength=1).max())))
     if association == "known" and log.identity is not None:
         settings.setdefault("landmarks", max(1, len(np.unique(log.identity[log.identity >= 0]))))
     if sensor == "bearing" and association == "maximum_likelihood":
         settings.setdefault("proposal", "informed")
     if sensor == "bearing" and association != "known" and "descriptors" not in settings:
-        settings["descriptors"] = len(fit_appearance_space(log).within)
+        settings["descriptors"] = len(log.appearance_space.within)
     return Config(sensor=sensor, association=association, **settings)
 
 
-def run(log, config=None, params=None, seed=0, progress=None, refine=True, checkpoints=None):
+def run(
+    log: Log,
+    config: Config | None = None,
+    params: Params | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int, str], None] | None = None,
+    refine: bool = True,
+    checkpoints: "Checkpoints | FollowerCheckpoints | None" = None,
+) -> Result:
     """Filter a whole log, and refine what it found.
 
     `config`: None for `config_for(log)`; `params`: None for `default_params`; `progress`: called
@@ -66,7 +82,7 @@ def run(log, config=None, params=None, seed=0, progress=None, refine=True, check
     config = config_for(log) if config is None else config
     params = default_params(config.sensor, log) if params is None else params
     params = validate(params, "params")
-    data = frames_of(log, config, params)
+    data = frames_from_log(log, config, params)
     if progress:
         progress(0, len(data.time), "")
     numbers = jax.tree.map(jnp.asarray, params)
@@ -118,7 +134,7 @@ def refine_result(result, progress=None):
     if past is None or not np.isfinite(past.pose).all():
         return result
     begin = time.perf_counter()
-    data = frames_of(log, dataclasses.replace(config, descriptors=0), result.params)
+    data = frames_from_log(log, dataclasses.replace(config, descriptors=0), result.params)
     try:
         found = refine(
             data, past.pose, past.landmark_id, log.start_pose, log.start_cov, result.params,
@@ -129,13 +145,6 @@ def refine_result(result, progress=None):
         return dataclasses.replace(result, refine_seconds=time.perf_counter() - begin)
     found = found._replace(identity=logged_identity(found.identity, data.identities))
     return dataclasses.replace(result, refined=found, refine_seconds=time.perf_counter() - begin)
-
-
-def frames_of(log, config, params):
-    """`Frames` of a log, as a configuration asks for them."""
-    known = config.association == "known"
-    sizes = config.measurements, params, known, config.descriptors
-    return frames_from_log(log, config.sensor, *sizes)
 
 
 def _filter(steps, key, at, data, params, config, renewal, progress, checkpoints):

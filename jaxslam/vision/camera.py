@@ -16,6 +16,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 POLYNOMIAL = ("cx", "cy", "c", "d", "e", "p1", "p2", "a0", "a2", "a3", "a4", "a5", "a6")
 UNIFIED = ("cx", "cy", "fx", "fy", "s", "xi", "k1", "k2", "p1", "p2")
@@ -86,20 +87,20 @@ class Camera:
         elif self["fx"] <= 0 or self["fy"] <= 0 or self["xi"] < 0:
             raise ValueError("camera: fx and fy must be above 0, and xi at least 0")
 
-    def __getitem__(self, name):
+    def __getitem__(self, name: str) -> float:
         """A parameter by name."""
         return float(self.params[parameter_names(self.model).index(name)])
 
     @property
-    def names(self):
+    def names(self) -> tuple[str, ...]:
         return parameter_names(self.model, len(self.params))
 
     @property
-    def size(self):
+    def size(self) -> tuple[int, int]:
         return self.width, self.height
 
     @property
-    def matrix(self):
+    def matrix(self) -> np.ndarray:
         """Matrix [3, 3] from the model frame to the robot's frame (improper for a mirror)."""
         back = -1.0 if self.mirror else 1.0
         base = np.diag([1.0, 1.0, back]) if self.lens == "up" else np.diag([1.0, -1.0, -back])
@@ -107,22 +108,22 @@ class Camera:
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
         return tilt_matrix(self.roll, self.pitch) @ turn @ base
 
-    def ray(self, pixel):
+    def ray(self, pixel: ArrayLike) -> np.ndarray:
         """Unit rays [..., 3] in the model frame of pixels [..., 2]; NaN outside the image."""
         pixel = np.asarray(pixel, float)
         ray = pixel_to_ray(self.model, self.params, self.size, pixel)
         return np.where(self._inside(pixel)[..., None], ray, np.nan)
 
-    def pixel(self, ray):
+    def pixel(self, ray: ArrayLike) -> np.ndarray:
         """Pixels [..., 2] of rays [..., 3] in the model frame; NaN outside the image."""
         pixel = ray_to_pixel(self.model, self.params, self.size, np.asarray(ray, float))
         return np.where(self._inside(pixel)[..., None], pixel, np.nan)
 
-    def direction(self, pixel):
+    def direction(self, pixel: ArrayLike) -> np.ndarray:
         """Unit directions [..., 3] in the robot's frame of pixels [..., 2]."""
         return self.ray(pixel) @ self.matrix.T
 
-    def project(self, direction):
+    def project(self, direction: ArrayLike) -> np.ndarray:
         """Pixels [..., 2] of directions [..., 3] in the robot's frame; NaN outside the image."""
         return self.pixel(np.asarray(direction, float) @ self.matrix)
 

@@ -26,7 +26,7 @@ BY_SUFFIX = {".toml": "toml", ".txt": "ocamcalib", ".yaml": "opencv", ".yml": "o
 ENDINGS = f"a camera file ends in one of {', '.join(BY_SUFFIX)}"
 
 
-def save_camera(path, camera, kind=None):
+def save_camera(path: str | Path, camera: Camera, kind: str | None = None) -> None:
     """Write a camera file atomically. `kind`: one of `FORMATS`, None: by the suffix of `path`.
 
     Raises `ValueError` if it can't be written, or if the format can't hold the camera.
@@ -44,7 +44,7 @@ def save_camera(path, camera, kind=None):
         file.write(text.encode())
 
 
-def load_camera(path, mirror=False, lens="up"):
+def load_camera(path: str | Path, mirror: bool = False, lens: str = "up") -> Camera:
     """Read a `Camera`: .toml, .txt of OCamCalib, .yaml of Kalibr (its cam0) or OpenCV.
 
     `mirror` and `lens` as in `Camera`, for formats that lack them. Raises `ValueError`.

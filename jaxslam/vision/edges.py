@@ -96,8 +96,8 @@ def _segments(peak, length, gap, slope):
     component = component[row, column]
     count = component.max(initial=0) + 1
     first, last = np.full(count, len(peak)), np.zeros(count)
-    np.minimum.at(first, component, row)
-    np.maximum.at(last, component, row)
+    np.minimum.at(first, component, row)  # ty: ignore[invalid-argument-type]  # integers
+    np.maximum.at(last, component, row)  # ty: ignore[invalid-argument-type]
     keep = (last - first + 1 >= length)[component]
     row, column, component = row[keep], column[keep], component[keep]
     order = np.lexsort((row, component))

@@ -5,6 +5,7 @@ far, so that an interrupted run resumes where it stopped and ends with the same 
 """
 
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -15,11 +16,13 @@ from jaxslam.logs.log_file import save_log
 from jaxslam.logs.odometry import increments
 from jaxslam.logs.readers.csv_files import read_odometry, read_truth
 from jaxslam.logs.readers.text_table import drop_bad_rows, parse, pose_at, read_lines
+from jaxslam.parameters import Params
+from jaxslam.vision.camera import Camera
 from jaxslam.vision.extraction_journal import ExtractionJournal
 from jaxslam.vision.image_times import NO_TIME, image_times
 from jaxslam.vision.images import Images, cv2
 from jaxslam.vision.lines import Lines, LineSettings, extract_lines, is_dark
-from jaxslam.vision.log_triangulation import triangulate_log
+from jaxslam.vision.log_triangulation import PointSettings, triangulate_log
 from jaxslam.vision.overlay import draw_on_image
 
 DETECTION = 0.5  # declared in the log: about half of the time, a line is hidden by furniture
@@ -32,21 +35,21 @@ CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
 
 
 def extract(
-    source,  # folder, file, pattern, list of files or video: see `Images`
-    camera,  # `Camera`
-    odometry,  # .csv of velocities or commands: see `readers.csv_files.read_odometry`
-    out=None,  # .npz to write; None: the `Log` is returned only, and a run can't be resumed
+    source: str | Path | Sequence[str | Path],  # as for `Images`
+    camera: Camera,
+    odometry: str | Path,  # .csv, velocities or commands: see `csv_files.read_odometry`
+    out: str | Path | None = None,  # .npz to write; None: cannot be resumed
     *,
-    times=None,  # .csv image,time_s; None: see `image_times`
-    truth=None,  # folder with any of poses.csv, landmarks.csv and plan.csv
-    lines=None,  # `LineSettings`
-    points=None,  # `PointSettings`
-    params=None,  # `Params` of the robot's motion, used for points and declared; None: defaults
-    reach=REACH,  # m, range of the camera
-    overlay=None,  # folder, .mp4 or .avi for the images with their lines drawn in
-    overwrite=False,  # replace `out`
-    progress=None,  # called with (images done, number of images)
-):
+    times: str | Path | None = None,  # .csv image,time_s; None: see `image_times`
+    truth: str | Path | None = None,  # folder with any of poses.csv, landmarks.csv and plan.csv
+    lines: LineSettings | None = None,
+    points: PointSettings | None = None,
+    params: Params | None = None,  # of the motion, declared in the log
+    reach: float = REACH,  # m, range of the camera
+    overlay: str | Path | None = None,  # folder or video to write, images with their lines
+    overwrite: bool = False,  # replace `out`
+    progress: Callable[[int, int], None] | None = None,  # images done, number of images
+) -> Log:
     """Make a `Log` from the images of a drive. A measurement is a line: its bearing [rad] in the
     robot's frame, `bearing_sigma`, a descriptor of 9 columns (elevations of the ends, polarity,
     colours left and right as blue, green, red), and a point [m] where its parallax suffices.

@@ -149,7 +149,7 @@ class Images:
     """
 
     def __init__(self, source):
-        self.video = None
+        self.video: Path | None = None
         if isinstance(source, (list, tuple)):
             self.files = [Path(file) for file in source]
         else:
@@ -157,7 +157,7 @@ class Images:
         if not self.files:
             allowed = " ".join(IMAGE_SUFFIXES)
             raise ValueError(f"{source}: no images; files ending in {allowed} are read")
-        if self.video:
+        if self.video:  # ty: ignore[redundant-condition]  # set by _find
             self.names = [f"{self.video.name}#{i:06d}" for i in range(_video_length(self.video))]
         else:
             self.names = [file.name for file in self.files]

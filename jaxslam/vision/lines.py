@@ -12,6 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from jaxslam.vision.camera import Camera
 from jaxslam.vision.edge_localisation import fit_segments, mean
 from jaxslam.vision.edges import PAD, find_edges
 from jaxslam.vision.images import check_size
@@ -86,7 +87,7 @@ class Lines(NamedTuple):
         return Lines(*(field[index] for field in self))
 
 
-def extract_lines(image, camera, settings=None):
+def extract_lines(image: np.ndarray, camera: Camera, settings: LineSettings | None = None) -> Lines:
     """Extract the `Lines` of an image uint8 [H, W, 3]; there may be none.
 
     Raises `ValueError` if the camera is calibrated for another size.

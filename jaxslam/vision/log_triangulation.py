@@ -5,13 +5,14 @@ in between. Works on any log of bearings, and uses the colours of lines if the l
 descriptor of 9 columns, as written by `extract`).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from jaxslam.logs.log import NOT_USED
+from jaxslam.logs.log import NOT_USED, Log
 from jaxslam.logs.odometry import increments, moments
-from jaxslam.parameters import default_params
+from jaxslam.parameters import Params, default_params
 from jaxslam.vision.matching import Appearance, MatchSettings, match_bearings
 from jaxslam.vision.triangulation import (
     OK,
@@ -108,7 +109,13 @@ class _Window:
         return np.searchsorted(self.frame, frames)
 
 
-def triangulate_log(log, params=None, settings=None, use_identity=False, progress=None):
+def triangulate_log(
+    log: Log,
+    params: Params | None = None,
+    settings: PointSettings | None = None,
+    use_identity: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Log:
     """Add `point`, `point_cov` and `point_baseline` to a log; returns the new log.
 
     Bearings without a point are counted by reason in `skipped`. A `position_scale` is declared for

@@ -21,7 +21,7 @@ from jaxslam.logs.appearance_space import fit_appearance_space
 from jaxslam.logs.log_file import save_log
 from jaxslam.models.sensors import Measurements
 from jaxslam.parameters import default_params
-from jaxslam.results.run_folder import errors
+from jaxslam.results.metrics import compute_errors
 from jaxslam.runs import run
 from jaxslam.simulation.planar import planar
 
@@ -125,8 +125,8 @@ def test_hidden_bearings_alone_get_looks_unless_told_otherwise(room):
     assert run.config_for(room, "bearing", descriptors=1).descriptors == 1
     assert run.config_for(planar(length_m=3.0)).descriptors == 0
     with pytest.raises(ValueError, match="3 descriptors are asked for, but 2 tell landmarks"):
-        frames_from_log(room, "bearing", descriptors=3)
-    with pytest.raises(ValueError, match="identities are known, so looks decide nothing"):
+        frames_from_log(room, run.config_for(room, "bearing", descriptors=3))
+    with pytest.raises(ValueError, match="identities are known, so appearance decides nothing"):
         Config(association="known", descriptors=1)
     with pytest.raises(ValueError, match=r"Config\.descriptors: -1 is not a whole number"):
         Config(descriptors=-1)
@@ -253,7 +253,7 @@ def test_looks_find_lines_that_bearings_alone_confuse(blurred):
     for changes in (dict(descriptors=0), dict()):
         config = run.config_for(blurred, "bearing", **settings, **changes)
         found = run.run(blurred, config, seed=0, refine=False)
-        got = errors(found)
+        got = compute_errors(found)
         right.append(got["association_accuracy"])
         wrong.append(got["landmarks_missed"] + got["landmarks_spurious"])
     assert right[1] > right[0] and wrong[1] < wrong[0] / 2, (right, wrong)

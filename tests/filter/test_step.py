@@ -30,7 +30,7 @@ def log():
 def setup(log, sensor="range_bearing", **settings):
     config = config_for(log, sensor, particles=PARTICLES, landmarks=30, block=8, **settings)
     params = default_params(sensor, log)
-    data = frames_from_log(log, sensor, config.measurements, params, config.association == "known")
+    data = frames_from_log(log, config, params)
     real = jnp.zeros(()).dtype
     data = jax.tree.map(
         lambda leaf: jnp.asarray(

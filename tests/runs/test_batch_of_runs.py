@@ -9,7 +9,8 @@ from jaxslam.cli import main as cli
 from jaxslam.logs.log_file import load_log
 from jaxslam.logs.slicing import cut
 from jaxslam.parameters import default_params
-from jaxslam.runs import batch, compiled, run
+from jaxslam.results.load import load_result
+from jaxslam.runs import batch, compiled, memory, run
 
 CONFIG = dict(particles=30, landmarks=30, measurements=10)  # test_offline's: compiled once
 
@@ -32,7 +33,7 @@ def three(woods):
 
 
 def state_bytes(config):
-    return batch.capacity.of_arrays(compiled.state_shapes(config))
+    return memory.bytes_of(compiled.state_shapes(config))
 
 
 def test_each_run_is_bit_for_bit_what_it_is_alone(woods, three):
@@ -67,7 +68,7 @@ def test_saved_are_the_table_and_each_runs_folder(three, woods, tmp_path):
     with open(tmp_path / "all" / "runs.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [row["err_rot"] for row in rows] == ["0.05", "0.05", "0.2"]
-    again = batch.report.load(tmp_path / "all" / "seed-4-err_rot-0.05")
+    again = load_result(tmp_path / "all" / "seed-4-err_rot-0.05")
     np.testing.assert_array_equal(again.pose, results[1].pose)
     with pytest.raises(ValueError, match="exists; choose another"):
         batch.save(todo, results, tmp_path / "all")

@@ -10,7 +10,7 @@ from jaxslam.logs.log_file import save_log
 from jaxslam.logs.slicing import cut
 from jaxslam.parameters import default_params
 from jaxslam.results import load
-from jaxslam.runs import batch, checkpoints, run
+from jaxslam.runs import batch, checkpoint_file, checkpoints, run
 from jaxslam.simulation.planar import planar
 from jaxslam.smoother import reassociation, refine
 
@@ -97,13 +97,13 @@ def test_a_finished_run_is_not_that_of_another_log(log, call, refuse):
 
 
 def test_a_signal_during_the_last_checkpoint_stops_the_run(log, monkeypatch):
-    write = checkpoints.checkpoint.write
+    write = checkpoint_file.write_checkpoint
 
     def signalled(*given):
         write(*given)
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(checkpoints.checkpoint, "write", signalled)
+    monkeypatch.setattr(checkpoint_file, "write_checkpoint", signalled)
     config = run.config_for(log, "range_bearing", particles=30, landmarks=30)
     with pytest.raises(KeyboardInterrupt, match="--resume"), checkpoints.Checkpoints("out") as kept:
         run.run(log, config, None, 0, None, True, kept)

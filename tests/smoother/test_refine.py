@@ -12,6 +12,7 @@ from jaxslam.logs.truth import wrap
 from jaxslam.models.sensors import Measurements
 from jaxslam.parameters import default_params
 from jaxslam.results.metrics import ate, pair_by_distance
+from jaxslam.runs.run import config_for
 from jaxslam.simulation import planar
 from jaxslam.smoother import least_squares as bundle
 from jaxslam.smoother import normal_equations
@@ -233,7 +234,8 @@ def room(sensor, known, **changes):
         "room", 2, length_m=40.0, rate_hz=2.5, landmarks=14, max_per_frame=6, **changes
     )
     params = default_params(sensor, log)
-    data = frames_from_log(log, sensor, None, params, known)
+    association = "known" if known else "maximum_likelihood"
+    data = frames_from_log(log, config_for(log, sensor, association, descriptors=0), params)
     true = log.truth.pose
     along = np.linspace(0, 3, len(true))
     bent = true + np.stack([0.3 * np.sin(along), 0.3 * (np.cos(along) - 1), 0.1 * np.sin(along)], 1)

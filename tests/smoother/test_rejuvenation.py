@@ -9,14 +9,21 @@ from test_refine import births, room
 
 from jaxslam import run
 from jaxslam.config import Config
-from jaxslam.filter import step
+from jaxslam.filter import map_estimate
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.odometry import Odometry
 from jaxslam.results.events import list_events
 from jaxslam.results.metrics import compute_errors
 from jaxslam.runs import compiled
 from jaxslam.runs import run as runner
 from jaxslam.simulation.planar import planar
-from jaxslam.smoother import least_squares, posterior_sampling, refine, rejuvenation
+from jaxslam.smoother import (
+    least_squares,
+    posterior_sampling,
+    reassociation,
+    refine,
+    rejuvenation,
+)
 from jaxslam.smoother.events import DROPPED, FAILED, FOUND, MERGED
 
 
@@ -54,7 +61,7 @@ def test_pose_and_points_are_those_of_the_whole_inverse(solved):
     """Against a dense inverse of the whole normal matrix, and of its part with the path given."""
     given, found = solved
     fit = found.fit
-    rows, which = refine.regroup.inside(found.groups)
+    rows, which = reassociation.in_field_of_view(found.groups)
     size, poses = len(rows), 3 * len(fit.path)
     with jax.enable_x64(True):
         linear = least_squares._linearise(given, fit.path, fit.points, which)
@@ -120,7 +127,7 @@ def test_drawn_particles_have_the_moments_asked_for(sensor):
         if sensor == "bearing":
             ray = np.stack([np.cos(mean[0]), np.sin(mean[0])]) / mean[1]
             mean = world.anchor[:, slot] + ray
-            _, cov, known = step.landmarks.to_world("bearing", world)
+            _, cov, known = map_estimate.to_world("bearing", world)
             l11, l21, l22 = joint.factor[:, slot]
             exact = l11**2, l11 * l21, l21**2 + l22**2
             assert known[slot].all()
@@ -170,7 +177,7 @@ def test_hidden_bearings_become_the_map(log, found):
 
 def test_events_say_what_became_of_the_map(found):
     done, kind, label, into = found.events.T
-    assert set(done) <= set(rejuvenation.due_frames(runner.frames_of(
+    assert set(done) <= set(rejuvenation.due_frames(frames_from_log(
         found.log, found.config, found.params).odometry, found.config.rejuvenate))  # fmt: skip
     held = set()
     for which, a, b in zip(kind, label, into, strict=True):

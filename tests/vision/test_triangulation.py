@@ -8,9 +8,9 @@ import pytest
 from jaxslam.logs.log import Log, Truth
 from jaxslam.logs.log_file import load_log, save_log
 from jaxslam.logs.odometry import Odometry, increments, moments
+from jaxslam.logs.slicing import select_frames
 from jaxslam.models import motion
 from jaxslam.parameters import default_params
-from jaxslam.reference.compare import select_frames
 from jaxslam.simulation import planar
 from jaxslam.vision.log_triangulation import PointSettings, triangulate_log
 from jaxslam.vision.triangulation import (

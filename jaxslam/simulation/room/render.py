@@ -10,6 +10,7 @@ import json
 import math
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -69,7 +70,7 @@ def double_mirror_camera(misalignment=1.0):
     centre, affine = (319.5 + 3.2 * m, 239.5 - 1.9 * m), (1 + 0.0030 * m, 0.0008 * m, 0.0008 * m)
     params = (*centre, *affine, 0.0012 * m, -0.0016 * m, *shape)
     tilt = {"roll": np.radians(0.6) * m, "pitch": np.radians(-0.45) * m}
-    place = {"yaw": math.pi / 2, "position": (0.0, 0.0, 0.6), "elevation": VIEW}
+    place: dict = {"yaw": math.pi / 2, "position": (0.0, 0.0, 0.6), "elevation": VIEW}
     return Camera(640, 480, "polynomial", np.array(params), **place, **tilt)
 
 
@@ -121,7 +122,9 @@ def _shoot(scene, rays, camera, pose, effects, light, k):
         image = cv2.GaussianBlur(image, (0, 0), effects.blur)
     if effects.interlace:
         dx, dy = effects.interlace * rng.standard_normal(2)
-        shaken = cv2.warpAffine(image, np.float32([[1, 0, dx], [0, 1, dy]]), image.shape[1::-1])
+        shaken = cv2.warpAffine(
+            image, np.array([[1, 0, dx], [0, 1, dy]], np.float32), image.shape[1::-1]
+        )
         image[1::2] = shaken[1::2]
     if effects.noise or effects.dark_noise:
         spread = np.sqrt(effects.dark_noise**2 + effects.noise**2 * np.maximum(image, 0))
@@ -135,23 +138,24 @@ def _shoot(scene, rays, camera, pose, effects, light, k):
 
 
 def render_room(
-    out,
-    seed=0,  # draws the room, the drive, the light and the noise
+    out: str | Path,
+    seed: int = 0,  # draws the room, the drive, the light and the noise
     *,
-    drive="loop",  # loop: rounds; straight: along a wall; turn: on the spot
-    step=0.2,  # m from image to image
-    length=None,  # m at least; None: 60 round and round, 6 straight; rad of a turn: a whole one
-    preset="normal",  # clean, normal or hard
-    effects=None,  # `Effects`, instead of the preset's
-    slip=0.025,  # mean share of every distance that wheels lose
-    turn_error=0.02,  # standard deviation of a turn's relative error
-    drift=0.01,  # rad/sqrt m
-    shadows=1.0,  # 0 to 1: how dark it is where things meet
-    plain=0.2,  # 0 to 1: the share of the furniture that hardly differs from the wall
-    camera=None,  # None: `double_mirror_camera()`
-    overwrite=False,
-    progress=None,  # called with (images done, all)
-):
+    drive: str = "loop",  # loop: rounds; straight: along a wall; turn: on the spot
+    step: float = 0.2,  # m from image to image
+    length: float
+    | None = None,  # m at least; None: 60 round and round, 6 straight; rad of a turn: a whole one
+    preset: str = "normal",  # clean, normal or hard
+    effects: Effects | None = None,  # instead of the preset's
+    slip: float = 0.025,  # mean share of every distance that wheels lose
+    turn_error: float = 0.02,  # standard deviation of a turn's relative error
+    drift: float = 0.01,  # rad/sqrt m
+    shadows: float = 1.0,  # 0 to 1: how dark it is where things meet
+    plain: float = 0.2,  # 0 to 1: the share of the furniture that hardly differs from the wall
+    camera: Camera | None = None,  # None: `double_mirror_camera()`
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,  # images done, images in all
+) -> int:
     """Write a drive through a rendered room into the folder `out`; the number of images.
 
     images/000000.png ... and frames.csv, odometry.csv (commands), camera.toml and
