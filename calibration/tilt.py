@@ -155,8 +155,7 @@ def _find_lines(images, camera, slope, report):
 def _normals(image, camera, slope, index):
     """`Normals` of one image's nearly vertical lines."""
     view = panorama(camera)
-    spacing = (view.elevation[0] - view.elevation[-1]) / (len(view.elevation) - 1)
-    length, gap = (max(2, round(angle / spacing)) for angle in (LENGTH, GAP))
+    length, gap = (max(2, round(angle / view.row_height)) for angle in (LENGTH, GAP))
     edges = find_edges(unwrap(image, view), view.valid, CONTRAST, SIGNIFICANCE, length, gap, slope)
     n = int(edges.segment.max(initial=-1)) + 1
     ray = directions(view.bearing(edges.column - PAD), view.elevation[edges.row])
