@@ -50,7 +50,7 @@ class Observed(NamedTuple):
     u: jax.Array
     bounds: candidate_slots.SlotBounds | None = None
     ancestry: Ancestry | None = None
-    looks: Appearances | None = None
+    appearances: Appearances | None = None
     free: jax.Array | None = None
 
 

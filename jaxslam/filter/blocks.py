@@ -109,7 +109,7 @@ def observe(state, chance, odometry, measurements, params, config, frozen=False)
     sensor_pose = compute_once(sure, lambda: sensors.sensor_pose_of(tuple(predicted), params))
     sensor_pose = barrier(jnp.stack(sensor_pose))
     alike = (
-        None if state.looks is None else appearance.log_likelihood_ratio(state.looks, measurements)
+        None if state.appearances is None else appearance.log_likelihood_ratio(state.appearances, measurements)
     )
     rows = _select_candidates(
         state, predicted, sensor_pose, odometry, measurements, alike, params, config
@@ -132,7 +132,7 @@ def observe(state, chance, odometry, measurements, params, config, frozen=False)
         past = past._replace(
             chain=jnp.where(found.used & ~state.bounds.used, lazy_resampling.CURRENT, past.chain)
         )
-    looked = state.looks
+    looked = state.appearances
     if looked is not None:
         looked = appearance.clear_slots(looked, found.used & ~state.bounds.used)
     touched = rows | found.used
@@ -140,7 +140,7 @@ def observe(state, chance, odometry, measurements, params, config, frozen=False)
         bounds = candidate_slots.lift(state.bounds, found.used | (rows & state.bounds.used))
     else:
         bounds = jax.tree.map(lambda new, old: jnp.where(touched, new, old), found, state.bounds)
-    return seen._replace(bounds=bounds, ancestry=past, looks=looked, free=free)
+    return seen._replace(bounds=bounds, ancestry=past, appearances=looked, free=free)
 
 
 def _select_candidates(

@@ -46,7 +46,7 @@ class State(NamedTuple):
     step: jax.Array
     bounds: candidate_slots.SlotBounds
     ancestry: Ancestry | None
-    looks: Appearances | None
+    appearances: Appearances | None
 
 
 class Info(NamedTuple):
@@ -112,7 +112,7 @@ def fresh_state(pose, world, step, bounds, config):
         ancestry=lazy_resampling.empty_ancestry(config)
         if config.lazy and config.resample_threshold
         else None,
-        looks=appearance.empty(config, pose.dtype),
+        appearances=appearance.empty(config, pose.dtype),
     )
 
 
@@ -209,10 +209,10 @@ def _info_specs():
 def advance(chance, state, odometry, measurements, params, config):
     """`step` with its random numbers given: `chance` is that of `draws`."""
     seen = blocks.observe(state, chance, odometry, measurements, params, config)
-    return conclude(chance, state, seen, measurements, config)
+    return weigh_and_resample(chance, state, seen, measurements, config)
 
 
-def conclude(chance, state, seen, measurements, config):
+def weigh_and_resample(chance, state, seen, measurements, config):
     """The second half of a step: weights of what was `seen` (`Observed`), estimate, resampling."""
     # Of all particles: every device works out the same from the same.
     pose, density, before = sharding.all_gather((seen.pose, seen.density, state.log_weight), config)
@@ -236,9 +236,9 @@ def conclude(chance, state, seen, measurements, config):
         seen.bounds,
         seen.ancestry,
         None
-        if seen.looks is None
+        if seen.appearances is None
         else appearance.update_appearances(
-            seen.looks, match, landmark_id, seen.free, state.step, measurements
+            seen.appearances, match, landmark_id, seen.free, state.step, measurements
         ),
     )
     resampled, ancestors = _resample(moved, wanted, chance.uniform, config)
