@@ -14,7 +14,13 @@ from jaxslam.filter import (
     new_landmarks,
     proposal,
 )
-from jaxslam.filter.block_update import Observed, move_block, update_block
+from jaxslam.filter.block_update import (
+    Observed,
+    Particles,
+    move_block,
+    update_general,
+    update_known_slots,
+)
 from jaxslam.filter.xla import barrier, compute_once, nonzero_indices, repeat, row_start
 from jaxslam.models import geometry, motion, sensors
 
@@ -117,7 +123,7 @@ def observe(state, chance, odometry, measurements, params, config, frozen=False)
     rows &= measurements.active
     world, past, rows = _apply_ancestry(state, rows, config)
     free = jnp.nonzero(~state.bounds.used, size=config.measurements, fill_value=config.landmarks)[0]
-    particles = pose, predicted, sensor_pose, chance.normals, chance.picks
+    particles = Particles(pose, predicted, sensor_pose, chance.normals, chance.picks)
     frame = odometry, measurements, alike, params, free, state.step
     match = jnp.full((config.measurements, n), association.PADDING, jnp.int32)
     zero = jnp.zeros(n, pose.dtype)
@@ -233,8 +239,10 @@ def _blocks(whole, particles, rows, frame, config, hold, size, chosen):
         # reading and writing of the large arrays stops its vectorisation: ten times slower.
         done = jax.lax.cond(
             measurements.active,
-            lambda *mine: update_block(
-                *mine, own, odometry, measurements, alike, params, config, hold
+            lambda *mine: (
+                update_general(*mine, odometry, measurements, alike, params, config, hold)
+                if own is None
+                else update_known_slots(*mine, odometry, measurements, own, params, config, hold)
             ),
             lambda *mine: move_block(*mine, odometry, params, config, hold),
             mine,
