@@ -49,8 +49,8 @@ class Particles(NamedTuple):
 class Observed(NamedTuple):
     """Particles after a frame's measurements, not yet resampled.
 
-    `pose` [3, N] (m, m, rad), the map, and `density` [N]: log of the particle's weight, motion times
-    measurements over what pose and matches were drawn from. `match` and `landmark_id` [K, N] as in
+    `pose` [3, N] (m, m, rad), the map, and `density` [N]: log of motion times measurements over
+    what pose and matches were drawn from. `match` and `landmark_id` [K, N] as in
     `step.Info`; `log_choice` [N]: log probability with which the matches were drawn. `counts`
     [2, N]: landmarks lost because no slot was free, and forgotten. `u` [3, N]: the normals from
     which `motion.sample` made the poses. The rest belongs to all particles (None for a block):
