@@ -3,7 +3,7 @@
 Drive straight past surveyed lines with images at known distances, triangulate, and look at how the
 points lie about the lines (paper, section III-B3 and fig. 6). Candidates are fitted on one half of
 the drive and scored on the other, both ways round, by their log density per point; the filter is
-the second judge: `with_model` writes a candidate's covariances into any log of points.
+the second judge: `apply_model` writes a candidate's covariances into any log of points.
 """
 
 from dataclasses import replace

@@ -72,18 +72,14 @@ def public_names(packages="jaxslam"):
     """A table of `jaxslam`'s public names that are defined in these modules or sub-packages."""
     packages = tuple(f"{package}." for package in packages.split(","))
     lines = ["| Name | Meaning |", "|---|---|"]
-    for name, where in {**jaxslam._WHERE, **jaxslam._MODULES}.items():
-        module = f"jaxslam.{where}"
+    for name, where in jaxslam._PUBLIC.items():
+        module, target = (
+            f"jaxslam.{part}" for part in (where.split(":")[0], where.replace(":", "."))
+        )
         if not f"{module}.".startswith(packages):
             continue
-        target = module if name in jaxslam._MODULES else f"{module}.{_defined(name)}"
         lines.append(_row((f"[`jaxslam.{name}`][{target}]", _first_sentence(module, target))))
     return "\n".join(lines) if len(lines) > 2 else "None of the names of `jaxslam` itself."
-
-
-def _defined(name):
-    """What a public name is called where it is defined."""
-    return getattr(jaxslam, name).__name__ if name == "errors" else name
 
 
 def _first_sentence(module, target):

@@ -8,11 +8,15 @@ int64 nanoseconds of one clock; lengths metres; angles radians, counter-clockwis
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxslam.logs.validation import assign, check_array, check_number, check_rows, check_stamps
 from jaxslam.parameters import FORMER_NAMES, Params
+
+if TYPE_CHECKING:
+    from jaxslam.logs.appearance_space import AppearanceSpace
 
 # Prefix of reasons in `Log.skipped` for rows that the filter has no use for (another robot seen).
 NOT_USED = "not used: "

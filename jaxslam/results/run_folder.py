@@ -234,7 +234,7 @@ def _write_files(result, folder, source, figures=True):
     if source is None:
         save_log(folder / "log.npz", result.log)
         source = "log.npz"
-    columns = {f.name: getattr(result, f.name) for f in fields(result) if f.metadata}
+    columns: dict = {f.name: getattr(result, f.name) for f in fields(result) if f.metadata}
     tables = {"map": result.landmarks} | {name: getattr(result, name) for name in SMOOTHED}
     for name, table in tables.items():
         if table is not None:
