@@ -73,18 +73,17 @@ def public_names(packages="jaxslam"):
     packages = tuple(f"{package}." for package in packages.split(","))
     lines = ["| Name | Meaning |", "|---|---|"]
     for name, where in jaxslam._PUBLIC.items():
-        module, target = (
-            f"jaxslam.{part}" for part in (where.split(":")[0], where.replace(":", "."))
-        )
-        if not f"{module}.".startswith(packages):
+        module, _, attribute = where.partition(":")
+        if not f"jaxslam.{module}.".startswith(packages):
             continue
-        lines.append(_row((f"[`jaxslam.{name}`][{target}]", _first_sentence(module, target))))
+        target = f"jaxslam.{module}.{attribute}".rstrip(".")
+        sentence = _first_sentence(f"jaxslam.{module}", attribute)
+        lines.append(_row((f"[`jaxslam.{name}`][{target}]", sentence)))
     return "\n".join(lines) if len(lines) > 2 else "None of the names of `jaxslam` itself."
 
 
-def _first_sentence(module, target):
+def _first_sentence(module, name):
     tree = ast.parse(_source(module).read_text(encoding="utf-8"))
-    name = target.removeprefix(module).lstrip(".")
     nodes = [node for node in tree.body if getattr(node, "name", None) == name] if name else [tree]
     text = " ".join((ast.get_docstring(nodes[0]) or "").split("\n\n")[0].split())
     return re.split(r"(?<=[.:]) (?=[A-Z`])", text)[0].rstrip(":").replace("|", "&#124;")

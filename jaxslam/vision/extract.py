@@ -79,7 +79,7 @@ def extract(
     settings = _fingerprint(images, time, kept, camera, lines)
     with ExtractionJournal(journal_path, settings) as journal:
         _extract_images(images, kept, camera, lines, journal, overlay, progress)
-    if all(isinstance(found, str) for _, found in journal.images):
+    if all(isinstance(lines, str) for _, lines in journal.images):
         journal.remove()  # there is nothing in it to resume from
     name = _log_name(source, out)
     log = _make_log(journal.images, time[kept], kind, table, camera, reach, skipped, name)

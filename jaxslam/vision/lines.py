@@ -112,7 +112,7 @@ def halves(image, camera, settings=None):
     wide = _columns_per_pixel(view)
     fit = fit_segments(edges, wide)
     keep = _upright(fit, view, settings, level)
-    keep &= (fit.last - fit.first) * _row_height(view) >= 2 * settings.length
+    keep &= (fit.last - fit.first) * view.row_height >= 2 * settings.length
     lower = edges.row > ((fit.first + fit.last) / 2)[edges.segment]
     count = [np.bincount(edges.segment, part, len(keep)) for part in (~lower, lower)]
     keep &= np.minimum(*count) >= LEAST_HALF
@@ -136,7 +136,7 @@ def _edges(picture, view, settings):
     levels = cv2.mean(channels, view.valid.view(np.uint8))
     level = max(float(np.mean(levels[: channels.shape[2]])), 1.0)
     length, gap = (
-        max(2, round(angle / _row_height(view))) for angle in (settings.length, settings.gap)
+        max(2, round(angle / view.row_height)) for angle in (settings.length, settings.gap)
     )
     contrast = settings.contrast * level / STEP / WIDEST
     edges = find_edges(
@@ -158,7 +158,7 @@ def _lines(edges, picture, view, settings, level):
     index = np.flatnonzero(keep)
     blurred = np.clip(fit.width[index] ** 2 - (SOFTER * usual) ** 2, 0, None)
     scatter = np.sqrt(fit.scatter[index] ** 2 + RAMP**2 * blurred)
-    half = _row_height(view) / 2
+    half = view.row_height / 2
     lines = Lines(
         bearing=view.bearing(fit.column[index] - PAD),
         sigma=np.hypot(scatter * view.step, settings.floor),
@@ -194,10 +194,6 @@ def _colours(edges, picture, fit):
         colour = picture[row[:, None], beside].mean(axis=1)
         sides.append(np.stack([mean(channel, segment, n) for channel in colour.T], -1))
     return (np.stack(sides, 1) / 255).astype(np.float32)
-
-
-def _row_height(view):
-    return (view.elevation[0] - view.elevation[-1]) / (len(view.elevation) - 1)
 
 
 def _columns_per_pixel(view, stride=90):

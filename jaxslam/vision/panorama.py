@@ -33,6 +33,11 @@ class Panorama(NamedTuple):
         """Spacing [rad] of the columns."""
         return 2 * pi / len(self.azimuth)
 
+    @property
+    def row_height(self):
+        """Spacing [rad] of the rows."""
+        return (self.elevation[0] - self.elevation[-1]) / (len(self.elevation) - 1)
+
     def bearing(self, column):
         """Azimuth [rad] in (-pi, pi] of fractional columns, also beyond the seam."""
         return _wrap(pi - (np.asarray(column) + 0.5) * self.step)

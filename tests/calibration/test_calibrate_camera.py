@@ -213,7 +213,7 @@ def test_doubtful_sets_are_warned_of():
     given["pixels"][9] = given["pixels"][10] = given["pixels"][2].copy()
     told = " / ".join(calibrate_corners(**given).warnings)
     assert "all boards are at one distance" in told
-    assert "board 2 and board 9 are the same picture: one counts twice (1 more" in told
+    assert "board 2 and board 9 are the same picture, which counts twice (1 more" in told
 
 
 @pytest.mark.parametrize(
@@ -232,7 +232,7 @@ def test_report_and_picture(tmp_path):
     given["pixels"][7][11] += [9.0, -7.0]
     found = calibrate_corners(**given)
     told = text(found)
-    assert "board 11" in told and "outlier left aside: board 7, corner 11" in told
+    assert "board 11" in told and "outlier excluded: board 7, corner 11" in told
     assert f"{found.rms:.3f}" in told and f"{found.bearings.rms_deg:.3f}°" in told
     draw(found, tmp_path / "camera.png")
     assert (tmp_path / "camera.png").stat().st_size > 50_000
