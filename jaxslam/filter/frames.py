@@ -27,7 +27,7 @@ class Frames(NamedTuple):
 
 
 def frames_from_log(log, config, params=None):
-    """`Frames` of a log for a `Config`: its sensor, K = `measurements`, `association`, `descriptors`.
+    """`Frames` of a log, as a `Config` wants them: sensor, K measurements, identities, descriptors.
 
     Of a frame with more than K measurements the farthest are dropped, or the last where there is no
     range. Identities are handed over only to association `known`. `params` (None: `default_params`)
@@ -71,7 +71,7 @@ def frames_from_log(log, config, params=None):
 
 
 def _values(log, sensor, params):
-    """Values [n, 2], covariances [n, 3] (xx, xy, yy) and distances [n] (None: unknown) of all rows."""
+    """Values [n, 2], covariances [n, 3] and distances [n] (None: unknown) of all rows."""
     cov = np.zeros((len(log.frame), 3))
     if sensor == "bearing":
         return np.column_stack([log.bearing, np.zeros(len(log.frame))]), cov, None
