@@ -11,7 +11,7 @@ Names are looked up at first use, so that `import jaxslam` does not import JAX.
 import importlib
 from typing import TYPE_CHECKING
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 _PUBLIC = {  # name: module, or module:attribute
     # Settings
