@@ -179,7 +179,7 @@ def _gather_packed(leaves):
 
 
 def _pack(leaves):
-    """Pack leaves [.., n] of the same item size into one array [rows, n]; with it (leaf, from, to)."""
+    """Pack leaves [.., n] of one item size into an array [rows, n]; with its (leaf, from, to)."""
     n = leaves[0].shape[-1]
     for size in sorted({leaf.dtype.itemsize for leaf in leaves}):
         number = {4: jnp.uint32, 8: jnp.uint64}[size]
@@ -235,7 +235,7 @@ def select_particle(tree, lane, config):
 
 
 def map_over_devices(function, items, count):
-    """Apply `function` to every item (first axis), sharded over `count` devices, in turn on each."""
+    """Map a function over items (first axis), sharded over `count` devices, in turn on each."""
     total = len(jax.tree.leaves(items)[0])
     if count == 1 or total == 1:
         return jax.lax.map(function, items)
