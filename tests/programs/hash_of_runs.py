@@ -37,6 +37,6 @@ for change in json.loads(sys.argv[3]):
         len(result.landmarks.id),
         len(result.pose),
         config.devices,
-        f"{found.seconds:.1f} s + {found.compile_seconds:.1f} s",
+        f"{result.seconds:.1f} s + {result.compile_seconds:.1f} s",
         flush=True,
     )
