@@ -92,7 +92,8 @@ def update_general(particles, world, odometry, measurements, ratios, params, con
     """
     sensor, informed = config.sensor, config.proposal == "informed"
     noise = sensors.correlated_noise(params, odometry)
-    predicted, sensor_pose, u, log_ratio = *particles[1:4], 0.0
+    pose, sensor_pose = particles.predicted, particles.sensor_pose
+    u, log_ratio = particles.normals, 0.0
 
     # Associate (section III-D): what each landmark would measure, against the alternatives.
     prediction, axes, jacobian = _predict(config, particles, world, odometry, params)
@@ -106,12 +107,10 @@ def update_general(particles, world, odometry, measurements, ratios, params, con
         config, scorer, measurements, new, clutter, params, particles.picks, ratios
     )
 
-    # Draw the pose from motion times measurements (FastSLAM 2.0), where `prior` has drawn it.
+    # Draw the pose from motion times measurements (FastSLAM 2.0); `prior` has drawn it before.
     if informed:
         posterior = proposal.inform(sensor, sensor_pose, axes, world, match, measurements, noise)
-        predicted, sensor_pose, u, log_ratio = _draw_pose(
-            particles, posterior, odometry, params, detach
-        )
+        pose, sensor_pose, u, log_ratio = _draw_pose(particles, posterior, odometry, params, detach)
 
     # Update the matched landmarks' EKFs (eqs. 5 and 6).
     repeated = config.association == "known" or not config.exclusive
@@ -127,7 +126,7 @@ def update_general(particles, world, odometry, measurements, ratios, params, con
         matched_ratios = jnp.take_along_axis(ratios, jnp.maximum(match, 0), 1)
         density = density + ordered_sum(jnp.where(match >= 0, matched_ratios, 0.0))
 
-    # Forget landmarks that should have been seen too often.
+    # Forget landmarks that were in view but not matched too often.
     forgotten = jnp.zeros_like(match[0])
     if config.forgetting:
         updated, forgotten = landmarks.update_existence(updated, prediction, params)
@@ -138,7 +137,7 @@ def update_general(particles, world, odometry, measurements, ratios, params, con
     updated = landmarks.unmark_matched(updated)
     landmark_id = jnp.take_along_axis(landmark_id, jnp.maximum(match, 0), 0)
     landmark_id = jnp.where(match >= 0, landmark_id, match)
-    return Observed(predicted, updated, density, match, landmark_id, log_choice, counts, u)
+    return Observed(pose, updated, density, match, landmark_id, log_choice, counts, u)
 
 
 def update_known_slots(particles, world, odometry, measurements, known, params, config, detach):
@@ -149,7 +148,8 @@ def update_known_slots(particles, world, odometry, measurements, known, params, 
     """
     sensor, informed = config.sensor, config.proposal == "informed"
     noise = sensors.correlated_noise(params, odometry)
-    predicted, sensor_pose, u, log_ratio = *particles[1:4], 0.0
+    pose, sensor_pose = particles.predicted, particles.sensor_pose
+    u, log_ratio = particles.normals, 0.0
 
     # Associate: the known slot, a new landmark, or clutter.
     _, axes, jacobian = _predict(config, particles, world, odometry, params)
@@ -161,13 +161,11 @@ def update_known_slots(particles, world, odometry, measurements, known, params, 
         known, world.count > 0, score, measurements, clutter, particles.picks
     )
 
-    # Draw the pose from motion times measurements (FastSLAM 2.0), where `prior` has drawn it.
+    # Draw the pose from motion times measurements (FastSLAM 2.0); `prior` has drawn it before.
     if informed:
         row = jnp.where(match >= 0, jnp.arange(len(match))[:, None], match)
         posterior = proposal.inform(sensor, sensor_pose, axes, world, row, measurements, noise)
-        predicted, sensor_pose, u, log_ratio = _draw_pose(
-            particles, posterior, odometry, params, detach
-        )
+        pose, sensor_pose, u, log_ratio = _draw_pose(particles, posterior, odometry, params, detach)
         fit = _fit_known(sensor, sensor_pose, world, known, measurements, noise)
 
     # Update the matched landmarks' EKFs (eqs. 5 and 6).
@@ -180,7 +178,7 @@ def update_known_slots(particles, world, odometry, measurements, known, params, 
     density = density + log_ratio - log_choice
     counts = jnp.zeros((2, match.shape[1]), jnp.int32)
     landmark_id = jnp.where(match >= 0, updated.landmark_id, match)
-    return Observed(predicted, updated, density, match, landmark_id, log_choice, counts, u)
+    return Observed(pose, updated, density, match, landmark_id, log_choice, counts, u)
 
 
 def _predict(config, particles, world, odometry, params):

@@ -126,8 +126,7 @@ def step(
 
 
 def advance(random_numbers, state, odometry, measurements, params, config):
-    """Do what `step` does, with the `RandomNumbers` given; on several devices with each one's
-    particles."""
+    """Advance particles by one step with its `RandomNumbers`; on several devices each its own."""
     # Move (eqs. 2 and 4), associate, weigh (eq. 3), update (eq. 5): each particle alone.
     observed = blocks.observe(state, random_numbers, odometry, measurements, params, config)
     # Normalise the weights (eq. 5), estimate, resample: all particles together.

@@ -10,7 +10,7 @@ from jaxslam.models.geometry import wrap
 
 
 class Estimate(NamedTuple):
-    """`mean` pose [3] (m, m, rad), its `cov` [3, 3], and `best`, the particle of greatest weight."""
+    """`mean` pose [3] (m, m, rad), its `cov` [3, 3], and the `best` (heaviest) particle."""
 
     mean: jax.Array
     cov: jax.Array

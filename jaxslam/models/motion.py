@@ -35,9 +35,9 @@ def model(odometry, params):
     """`Motion` of one interval of odometry, with the systematic gains applied.
 
     Drift accrues evenly along the chord, so its lever has mean 1/2 and variance 1/12; turning noise
-    has the odometry's lever. Sideways noise is lever x length x heading noise: the two kinds together
-    have slope cov(side, heading) / var(heading), and what is left of the variance is written as a
-    sum, which can't cancel below zero.
+    has the odometry's lever. Sideways noise is lever x length x heading noise: the two kinds have
+    slope cov(side, heading) / var(heading) together, and the rest of the variance is written as a
+    sum, which cannot cancel below zero.
     """
     o = odometry
     moved = (o.dx != 0) | (o.dy != 0)

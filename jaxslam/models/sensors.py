@@ -198,7 +198,7 @@ def locate(sensor, sensor_pose, value, cov, params):
 
 
 def log_new_density(sensor, value, params):
-    """Log density of measurements `value` of new landmarks, of which there are `density_new` per m^2."""
+    """Log density of measurements `value` of new landmarks, `density_new` of them per m^2."""
     if sensor == "bearing":
         area = params.view_range**2 / 2 + jnp.zeros_like(value[0])
     elif sensor == "position":

@@ -75,16 +75,16 @@ def euler(log, steps=200):
     return np.array(out).T
 
 
-def random_log(seed, rows=40, looks=25):
+def random_log(seed, rows=40, count=25):
     rng = np.random.default_rng(seed)
     odometry = np.column_stack([rng.normal(0.3, 0.5, rows), rng.normal(0, 1, rows)])
     odometry[rng.random(rows) < 0.2, 0] = 0  # turning on the spot
     odometry[rng.random(rows) < 0.2, 1] = 0  # straight
     odometry[rng.random(rows) < 0.1] = 0
     times = np.cumsum(rng.uniform(0.02, 0.4, rows))
-    looked = np.sort(rng.uniform(-1, times[-1] + 2, looks))
-    looked[3] = times[10]  # a frame at a stamp of odometry
-    return make(times, odometry, np.sort(looked))
+    frame_s = np.sort(rng.uniform(-1, times[-1] + 2, count))
+    frame_s[3] = times[10]  # a frame at a stamp of odometry
+    return make(times, odometry, np.sort(frame_s))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -171,12 +171,12 @@ def test_thinned_frames_describe_the_same_motion(kind):
     rng = np.random.default_rng(1)
     time_s = np.arange(2000) * 0.015
     odometry = rng.normal(0, 1, (2000, 2)) * (0.3, 0.5)
-    looks = np.sort(rng.choice(time_s, 500, replace=False)) + 0.004
+    frame_s = np.sort(rng.choice(time_s, 500, replace=False)) + 0.004
     start = (3.0, -2.0, 3.0)
-    dense = increments(make(time_s, odometry, looks, odometry_kind=kind))
+    dense = increments(make(time_s, odometry, frame_s, odometry_kind=kind))
     path = dead_reckoning(dense, start)
     for step in (3, 20, 500):
-        few = looks[step - 1 :: step]
+        few = frame_s[step - 1 :: step]
         o = increments(make(time_s, odometry, few, odometry_kind=kind))
         np.testing.assert_allclose(dead_reckoning(o, start), path[step - 1 :: step], atol=1e-10)
         for name in ("distance", "turn", "duration"):

@@ -96,7 +96,7 @@ def test_a_moved_or_mirrored_world_gives_the_answer_moved_or_mirrored(x64, log, 
     state, info = drive(config, params, data, chance)
     assert info.resampled.sum() > 3
     assert (info.log_choice.min() < -0.1) == (settings == DRAWN)
-    # Without a look informed particles, too, are drawn from the motion model.
+    # Without measurements informed particles, too, are drawn from the motion model.
     before = info.pose[BLIND - 1][:, info.ancestors[BLIND - 1]]
     odometry = jax.tree.map(lambda leaf: leaf[BLIND], data[0])
     expected = jnp.stack(motion.sample(before, odometry, params, chance.normals[BLIND]))
