@@ -72,23 +72,18 @@ def public_names(packages="jaxslam"):
     """A table of `jaxslam`'s public names that are defined in these modules or sub-packages."""
     packages = tuple(f"{package}." for package in packages.split(","))
     lines = ["| Name | Meaning |", "|---|---|"]
-    for name, where in {**jaxslam._WHERE, **jaxslam._MODULES}.items():
-        module = f"jaxslam.{where}"
-        if not f"{module}.".startswith(packages):
+    for name, where in jaxslam._PUBLIC.items():
+        module, _, attribute = where.partition(":")
+        if not f"jaxslam.{module}.".startswith(packages):
             continue
-        target = module if name in jaxslam._MODULES else f"{module}.{_defined(name)}"
-        lines.append(_row((f"[`jaxslam.{name}`][{target}]", _first_sentence(module, target))))
+        target = f"jaxslam.{module}.{attribute}".rstrip(".")
+        sentence = _first_sentence(f"jaxslam.{module}", attribute)
+        lines.append(_row((f"[`jaxslam.{name}`][{target}]", sentence)))
     return "\n".join(lines) if len(lines) > 2 else "None of the names of `jaxslam` itself."
 
 
-def _defined(name):
-    """What a public name is called where it is defined."""
-    return getattr(jaxslam, name).__name__ if name == "errors" else name
-
-
-def _first_sentence(module, target):
+def _first_sentence(module, name):
     tree = ast.parse(_source(module).read_text(encoding="utf-8"))
-    name = target.removeprefix(module).lstrip(".")
     nodes = [node for node in tree.body if getattr(node, "name", None) == name] if name else [tree]
     text = " ".join((ast.get_docstring(nodes[0]) or "").split("\n\n")[0].split())
     return re.split(r"(?<=[.:]) (?=[A-Z`])", text)[0].rstrip(":").replace("|", "&#124;")

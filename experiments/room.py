@@ -29,7 +29,7 @@ from jaxslam.logs.truth import truth_at
 from jaxslam.results.metrics import association_accuracy, ate, pair_by_distance
 from jaxslam.simulation.room.furniture import furnish
 from jaxslam.simulation.room.geometry import visible_edges
-from jaxslam.simulation.room.render import double_mirror_camera, nominal, render_room
+from jaxslam.simulation.room.render import double_mirror_camera, nominal_camera, render_room
 from jaxslam.vision.camera_files import load_camera
 from jaxslam.vision.extract import extract
 from jaxslam.vision.images import read_image
@@ -273,7 +273,7 @@ def draw_lines_found(place, camera, path):
 
 def ablated(camera):
     """Name -> camera and settings of the extraction, one part left out each."""
-    flat = nominal(camera)
+    flat = nominal_camera(camera)
     blind = PointSettings(use_colour=False)
     return {
         "all parts": (camera, {}),

@@ -1,4 +1,4 @@
-"""From a log to what the filter eats: one odometry increment and one padded row per frame."""
+"""Convert a log to frames: odometry since the frame before, and K measurements, padded."""
 
 from typing import NamedTuple
 
@@ -11,9 +11,12 @@ from jaxslam.parameters import default_params
 
 
 class Frames(NamedTuple):
-    """T frames in K slots each: `time` int64 [T] ns, `odometry` of the interval that ends there,
-    `measurements`, log identities of the dense ones [I], each slot's row in the log [T, K] (-1:
-    padding), and how many rows were dropped, by reason."""
+    """T frames of up to K measurements.
+
+    `time`: int64 [T], ns. `odometry`: of the intervals that end there, leaves [T]. `measurements`:
+    leaves [T, K, ..], with identities 0 to I - 1. `identities` [I]: these in the log. `row` [T, K]:
+    each measurement's row in the log (-1: padding). `dropped`: counts of rows left out, by reason.
+    """
 
     time: np.ndarray
     odometry: Odometry
@@ -37,18 +40,18 @@ def frames_from_log(log, config, params=None):
         raise ValueError(
             f"{log.name}: sensor {sensor!r} is not in this log; it has {' '.join(has)}"
         )
-    value, cov, reach = _values(log, sensor, params)
-    # A bearing without a point is no position; nothing of it is lost, so nothing is counted.
+    value, cov, distance = _values(log, sensor, params)
+    # A bearing without a point is no position: nothing is lost with it, so it is not counted.
     rows = np.flatnonzero(np.isfinite(value).all(axis=1))
     dropped = {}
     identity, identities = np.full(len(log.frame), -1), np.empty(0, np.int64)
     if known:
         rows = _with_identity(log, rows, dropped)
         identities, identity[rows] = np.unique(log.identity[rows], return_inverse=True)
-    rows, column = _place(log, rows, reach, config.measurements, dropped)
+    rows, column = _place(log, rows, distance, config.measurements, dropped)
     row = np.full((len(log.frame_time), config.measurements), -1)
     row[log.frame[rows], column] = rows
-    # Padding, row -1, reads the last row, which is appended here.
+    # Padding (row -1) reads the last row, which is appended here.
     return Frames(
         time=log.frame_time,
         odometry=increments(log),
@@ -68,7 +71,7 @@ def frames_from_log(log, config, params=None):
 
 
 def _values(log, sensor, params):
-    """Values [n, 2], covariances [n, 3] (xx, xy, yy) and distances (None: unknown) of all rows."""
+    """Values [n, 2], covariances [n, 3] (xx, xy, yy) and distances [n] (None: unknown) of all rows."""
     cov = np.zeros((len(log.frame), 3))
     if sensor == "bearing":
         return np.column_stack([log.bearing, np.zeros(len(log.frame))]), cov, None
@@ -86,28 +89,28 @@ def _values(log, sensor, params):
 
 
 def _appearance_columns(log, size, row):
-    """`Measurements.descriptor` [T, K, J] and `within` [T, J] of the slots' rows."""
+    """`Measurements.descriptor` [T, K, J] and `within` [T, J] of rows [T, K]."""
     if not size:
         return {}
-    found = log.appearance_space
-    if len(found.within) < size:
+    space = log.appearance_space
+    if len(space.within) < size:
         raise ValueError(
-            f"{log.name}: {size} descriptors are asked for, but {len(found.within)} tell landmarks "
+            f"{log.name}: {size} descriptors are asked for, but {len(space.within)} tell landmarks "
             "apart in this log (of a part of a log: make its own config, or take 0)"
         )
-    coordinates = np.vstack([found.coordinates[:, :size], np.zeros((1, size))])
-    return dict(descriptor=coordinates[row], within=np.tile(found.within[:size], (len(row), 1)))
+    coordinates = np.vstack([space.coordinates[:, :size], np.zeros((1, size))])
+    return dict(descriptor=coordinates[row], within=np.tile(space.within[:size], (len(row), 1)))
 
 
 def _scale(log, sensor, row):
-    """`Measurements.scale` of the slots' rows [T, K]; None where no size rests on odometry."""
+    """`Measurements.scale` of rows [T, K]; None where no position rests on odometry."""
     if sensor != "position" or not log.has_points() or log.point_baseline is None:
         return None
     return np.append(np.isfinite(log.point_baseline), False)[row].astype(float)
 
 
 def _with_identity(log, rows, dropped):
-    """Those of the rows that carry an identity, the first of each identity in a frame."""
+    """The rows with an identity, of each identity in a frame the first."""
     if log.identity is None or (len(log.identity) and (log.identity < 0).all()):
         raise ValueError(f"{log.name}: association 'known' needs identities; this log has none")
     _count(dropped, "no identity", int((log.identity[rows] < 0).sum()))
@@ -118,9 +121,10 @@ def _with_identity(log, rows, dropped):
     return rows[first]
 
 
-def _place(log, rows, reach, most, dropped):
+def _place(log, rows, distance, most, dropped):
     """The `most` nearest rows of every frame, in the log's order, and their places in the frame."""
-    rank = _rank(log.frame[rows]) if reach is None else _rank(log.frame[rows], reach[rows])
+    order = None if distance is None else distance[rows]
+    rank = _rank(log.frame[rows], order)
     keep = rank < most
     _count(dropped, "no measurement slot", int((~keep).sum()))
     rows = rows[keep]
@@ -128,7 +132,7 @@ def _place(log, rows, reach, most, dropped):
 
 
 def _rank(frame, order=None):
-    """Place of every row among those of its frame, by `order` or as they come; frames sorted."""
+    """Rank of every row within its frame (sorted), by `order` or as they come."""
     first = np.searchsorted(frame, frame)
     place = np.arange(len(frame)) - first
     if order is None:

@@ -152,7 +152,7 @@ class Log:
         return min(int(self.odometry_time[0]), int(self.frame_time[0]))
 
     @cached_property
-    def appearance_space(self):
+    def appearance_space(self) -> "AppearanceSpace":
         """`AppearanceSpace` of the log's descriptors, fitted when first used."""
         from jaxslam.logs.appearance_space import fit_appearance_space  # here: SciPy is slow
 

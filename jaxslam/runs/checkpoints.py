@@ -335,7 +335,7 @@ def _current_entries(get, stored):
 
     def get_by_either(name):
         former = name.replace("summary.landmark_id", "summary.match")
-        former = former.replace("landmark_id", "birth")
+        former = former.replace("landmark_id", "birth").replace(".appearances", ".looks")
         return get(name if name in stored else former)
 
     return get_by_either

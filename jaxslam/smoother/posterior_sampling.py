@@ -116,7 +116,7 @@ def _draw(key, joint, step, known, config):
     return (
         state
         if known is None
-        else state._replace(looks=appearance.reorder_slots(known, joint.landmark_id))
+        else state._replace(appearances=appearance.reorder_slots(known, joint.landmark_id))
     )
 
 

@@ -145,5 +145,5 @@ def test_the_command_line_page_has_every_command():
 def test_the_python_page_has_every_public_name():
     import jaxslam
 
-    page = hooks().public_names()
+    page = hooks().public_names("jaxslam")
     assert set(re.findall(r"^\| \[`jaxslam\.(\w+)`\]", page, re.MULTILINE)) == set(jaxslam.__all__)

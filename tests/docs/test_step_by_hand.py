@@ -1,4 +1,4 @@
-"""The loop over `init` and `step` in docs/how-to/step-by-step.md runs, and its helpers pad and convert."""
+"""The loop over `init` and `step` in docs/how-to/step-by-step.md runs; its helpers pad and convert."""
 
 import re
 from pathlib import Path

@@ -39,8 +39,8 @@ def assert_agree(log, config):
     assert found.same == found.steps == STEPS
     assert max(found.pose, found.log_weight, found.landmarks) <= 1e-9
     assert found.resampled >= 10
-    assert found.born >= 5
-    assert found.freed >= 1 or not config.forgetting
+    assert found.begun >= 5
+    assert found.forgotten >= 1 or not config.forgetting
     assert jnp.ones(1).dtype == jnp.float32  # float64 was not left switched on
     return found
 
@@ -71,7 +71,7 @@ def test_baseline_and_filter_agree_on_points_that_rest_on_odometry(woods):
 
 def test_baseline_and_filter_agree_on_the_papers_rules(woods):
     found = assert_agree(woods, Config.paper(**SIZES))
-    assert found.freed == found.clutter == 0
+    assert found.forgotten == found.clutter == 0
 
 
 def small(steps=12):
@@ -121,7 +121,7 @@ def test_the_baselines_map_is_what_its_best_particle_is_sure_of():
     def found(sensor, **rules):
         config = Config(sensor=sensor, **rules)
         given = reference, params, config, np.array([40, 41, 42]), np.array([10.0, 20, 0])
-        return [column.tolist() for column in compare._baseline_map(*given)]
+        return [column.tolist() for column in compare._map_of_best(*given)]
 
     assert found("position") == [[[10.0, 20.5], [10.0, 20.5]], [40, -1]]
     assert len(found("position", forgetting=False)[0]) == 3

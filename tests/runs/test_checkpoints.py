@@ -1,5 +1,6 @@
 """Long runs: what is put aside is gone on with bit for bit, and nothing is lost on the way."""
 
+import dataclasses
 import errno
 import io
 import os
@@ -49,7 +50,7 @@ def same(a, b):
 
 def columns(result):
     """All that a run found, but for times."""
-    found = {name: getattr(result, name) for name in run_folder.COLUMNS}
+    found = {f.name: getattr(result, f.name) for f in dataclasses.fields(result) if f.metadata}
     return found | {n: getattr(result, n) for n in ("landmarks", "ancestral", "lineage")}
 
 

@@ -11,7 +11,7 @@ from stripes import mirror_camera, painted, photograph, room_of_stripes, stripes
 
 from jaxslam.simulation.room.furniture import furnish
 from jaxslam.simulation.room.geometry import visible_edges
-from jaxslam.simulation.room.render import PRESETS, double_mirror_camera, frames
+from jaxslam.simulation.room.render import PRESETS, double_mirror_camera, render_frames
 from jaxslam.vision.line_merging import merge_pieces, separate_close_pairs
 from jaxslam.vision.lines import Lines, LineSettings, extract_lines, halves, is_dark
 from jaxslam.vision.overlay import draw_lines, draw_on_image
@@ -288,7 +288,7 @@ def test_the_rendered_rooms_edges_are_found(preset, most):
     poses = np.array([(1.3, 1.2, 0.4), (4.1, 0.9, 2.0), (6.2, 3.0, -1.0), (8.6, 2.7, -2.5)])
     drive = SimpleNamespace(pose=poses, command=np.zeros((3, 2)))
     errors, clear, found, false = [], 0, 0, 0
-    for image, pose, _ in frames(world, camera, drive, PRESETS[preset], seed=20):
+    for image, pose, _ in render_frames(world, camera, drive, PRESETS[preset], seed=20):
         edges, lines = visible_edges(world, pose), extract_lines(image, camera)
         i, _, away = paired(edges.bearing, lines)
         errors.extend(np.degrees(away))
