@@ -23,7 +23,7 @@ from jaxslam.simulation.room.furniture import furnish
 from jaxslam.simulation.room.render import PRESETS, double_mirror_camera, render_frames
 from jaxslam.simulation.room.trajectory import stop_and_go
 from jaxslam.vision.lines import extract_lines
-from jaxslam.vision.matching import MatchSettings, match
+from jaxslam.vision.matching import match
 
 RESULTS = Path(__file__).parent / "results"
 SEEDS = (111, 112, 113, 114)
@@ -58,7 +58,7 @@ def lines_row(preset):
 
 def match_row(step, colour):
     """Precision and recall of matches between neighbouring frames of `normal` light."""
-    camera, settings = double_mirror_camera(), MatchSettings(use_colour=colour)
+    camera = double_mirror_camera()
     right = made = possible = met = 0
     for seed in SEEDS:
         world, drive = furnish(seed), stop_and_go("loop", seed, step=step, length=5.0)
@@ -68,7 +68,7 @@ def match_row(step, colour):
             identity, error, _, _ = named(lines.bearing, world, pose)
             identity = np.where(np.abs(error) < SAME, identity, -1)  # surely that edge
             if before is not None:
-                pairs = match(before[0], lines, (command[0], 0.0, command[1]), settings)
+                pairs = match(before[0], lines, (command[0], 0.0, command[1]), colour)
                 pairs = pairs[before[1][pairs[:, 0]] >= 0]
                 to = world.edges.point[before[1][pairs[:, 0]]] - pose[:2]
                 there = np.arctan2(to[:, 1], to[:, 0]) - pose[2]

@@ -35,7 +35,6 @@ from jaxslam.vision.extract import extract
 from jaxslam.vision.images import read_image
 from jaxslam.vision.lines import LineSettings, extract_lines
 from jaxslam.vision.log_triangulation import PointSettings
-from jaxslam.vision.matching import MatchSettings
 from jaxslam.vision.overlay import draw_lines, draw_on_image
 from jaxslam.vision.panorama import panorama, unwrap
 
@@ -275,7 +274,7 @@ def draw_lines_found(place, camera, path):
 def ablated(camera):
     """Name -> camera and settings of the extraction, one part left out each."""
     flat = nominal_camera(camera)
-    blind = PointSettings(matching=MatchSettings(use_colour=False))
+    blind = PointSettings(use_colour=False)
     return {
         "all parts": (camera, {}),
         "calibration off": (replace(flat, roll=camera.roll, pitch=camera.pitch), {}),

@@ -76,14 +76,9 @@ def camera(
     check_new(report, overwrite, "a picture", ".png")
     with progress_bar("finding corners") as progress:
         calibration = calibrate_camera(
-            list(images) if len(images) > 1 else images[0],
-            _parse_board(board),
-            square,
-            model=model,
-            mirror=mirror,
-            lens=lens,
-            progress=progress,
-        )
+            list(images) if len(images) > 1 else images[0], _parse_board(board), square,
+            model=model, mirror=mirror, lens=lens, progress=progress,
+        )  # fmt: skip
     save_camera(out, calibration.camera)
     draw(calibration, report)
     print(text(calibration))
@@ -261,15 +256,9 @@ def room(
 
     with progress_bar("rendering") as progress:
         frames = render_room(
-            out,
-            seed=seed,
-            drive=drive,
-            step=step,
-            length=length,
-            preset=preset,
-            overwrite=overwrite,
-            progress=progress,
-        )
+            out, seed=seed, drive=drive, step=step, length=length, preset=preset,
+            overwrite=overwrite, progress=progress,
+        )  # fmt: skip
     inputs = f"--camera {out / 'camera.toml'} --odometry {out / 'odometry.csv'} --truth {out}"
     print(f"{out}: {frames} images; next: jaxslam extract {out / 'images'} {inputs} --out OUT.npz")
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxslam.logs.log import NOT_USED, Log
 from jaxslam.logs.odometry import increments, moments
 from jaxslam.parameters import Params, default_params
-from jaxslam.vision.matching import Appearance, MatchSettings, match_bearings
+from jaxslam.vision.matching import NEAREST, Appearance, match_bearings
 from jaxslam.vision.triangulation import (
     OK,
     PARALLEL,
@@ -44,8 +44,8 @@ class PointSettings:
     between the two frames of a point. `pairs` of frames of one line: "disjoint" (no two share a
     frame), "consecutive" (each starts where the last ended, as in the paper) or "overlapping" (a
     pair ends at every frame). `memory`: frames for which a line may be missed. `sigma` rad:
-    standard deviation of bearings, for a log that has none. Raises `ValueError` for values out of
-    range.
+    standard deviation of bearings, for a log that has none. `use_colour`: match by colours too.
+    Raises `ValueError` for values out of range.
 
     Points over the same stretch of road share the error of its odometry, so a filter that assumes
     independent errors becomes overconfident. The log therefore declares a `position_scale`: the
@@ -60,7 +60,7 @@ class PointSettings:
     inflation: float = 16.0
     memory: int = 3
     sigma: float | None = None
-    matching: MatchSettings = field(default_factory=MatchSettings)
+    use_colour: bool = True
     triangulation: TriangulationSettings = field(default_factory=TriangulationSettings)
 
     def __post_init__(self):
@@ -180,11 +180,11 @@ class _LogLines:
         self.sigma = np.full(len(log.frame), common) if sigma is None else np.asarray(sigma)
         self.appearance = None
         coloured = log.descriptor is not None and log.descriptor.shape[1] == 9
-        if coloured and settings.matching.use_colour:
+        if coloured and settings.use_colour:
             d = log.descriptor
             self.appearance = Appearance(d[:, 0], d[:, 1], d[:, 2], d[:, 3:].reshape(-1, 2, 3))
 
-    def match(self, before, after, motion, heading_sigma, depth, settings):
+    def match(self, before, after, motion, heading_sigma, depth):
         """Match the rows `before` and `after`: pairs [m, 2] of indices into them."""
         if self.identity is not None:
             same = self.identity[before][:, None] == self.identity[after][None, :]
@@ -194,15 +194,8 @@ class _LogLines:
             appearances = [
                 Appearance(*(part[rows] for part in appearances)) for rows in (before, after)
             ]
-        return match_bearings(
-            (self.bearing[before], self.bearing[after]),
-            (self.sigma[before], self.sigma[after]),
-            motion,
-            appearances,
-            settings.matching,
-            heading_sigma,
-            depth,
-        )
+        bearings, sigmas = ((part[before], part[after]) for part in (self.bearing, self.sigma))
+        return match_bearings(bearings, sigmas, motion, appearances, heading_sigma, depth)
 
 
 def _extend_tracks(tracks, frame, rows, window, lines, settings):
@@ -221,11 +214,10 @@ def _extend_tracks(tracks, frame, rows, window, lines, settings):
         before = np.array([track.sightings[-1][1] for track in alive])
         depth = np.array([track.depth for track in alive])
         sigma = np.sqrt(window.cov[at, 2, 2])
-        for i, k in lines.match(before, rows, window.motion[at], sigma, depth, settings):
+        for i, k in lines.match(before, rows, window.motion[at], sigma, depth):
             alive[i].sightings.append((frame, rows[k]))
             matched[k] = True
-    unknown = (0.0, 1 / settings.matching.nearest)
-    return alive + [_Track([(frame, row)], 0, unknown) for row in rows[~matched]]
+    return alive + [_Track([(frame, row)], 0, (0.0, 1 / NEAREST)) for row in rows[~matched]]
 
 
 def _triangulate_tracks(tracks, window, lines, settings, out):
@@ -240,8 +232,7 @@ def _triangulate_tracks(tracks, window, lines, settings, out):
     for track, q, ratio in zip(tracks, inverse, far.parallax, strict=True):
         if q > 0:
             spread = DEPTH_SIGMAS * q / ratio
-            most = 1 / settings.matching.nearest
-            track.depth = (max(q - spread, 0.0), min(q + spread, most))
+            track.depth = (max(q - spread, 0.0), min(q + spread, 1 / NEAREST))
     point, cov, base, outcome = out
     start = [_pair_start(track, window, settings) for track in tracks]
     outcome[row] = SHORT

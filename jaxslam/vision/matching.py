@@ -6,35 +6,21 @@ pair is allowed if its change of bearing lies in that interval; differences of c
 elevations add to its cost. The cheapest one-to-one assignment is chosen, over all pairs at once.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 FORBIDDEN = 1e6
+NEAREST = 0.3  # m, least depth of a line
+TYPICAL_DEPTH = 3.0  # m; changes of bearing larger than at this depth cost more
+GATE = 3.5  # standard deviations by which a change of bearing may exceed its interval
+HEADING_SIGMA = 0.012  # rad, of the motion if no covariance is given
+TRAVEL_SIGMA = 0.1  # share of the distance
+COLOUR_SIGMA = 0.1  # share of the brightness, between two frames
 DARK_SIGMA = 0.015  # standard deviation of black, of 0..1
-
-
-@dataclass(frozen=True)
-class MatchSettings:
-    """Settings of the matching. `nearest` m: least depth of a line. `typical_depth` m: changes of
-    bearing larger than at this depth cost more. `gate`: standard deviations by which a change of
-    bearing may exceed its interval. `heading_sigma` rad and `travel_sigma` (share of the distance):
-    error of the motion if no covariance is given. `colour_sigma` (share of the brightness) and
-    `elevation_sigma` rad: standard deviations between two frames. `unmatched`: cost of leaving a
-    line unmatched, in half squared standard deviations. `use_colour`: compare colours, not only
-    bearings."""
-
-    nearest: float = 0.3
-    typical_depth: float = 3.0
-    gate: float = 3.5
-    heading_sigma: float = 0.012
-    travel_sigma: float = 0.1
-    colour_sigma: float = 0.1
-    elevation_sigma: float = 0.03
-    unmatched: float = 5.0
-    use_colour: bool = True
+ELEVATION_SIGMA = 0.03  # rad, between two frames
+UNMATCHED = 5.0  # cost of leaving a line unmatched, in half squared standard deviations
 
 
 class Appearance(NamedTuple):
@@ -47,26 +33,18 @@ class Appearance(NamedTuple):
     colour: np.ndarray
 
 
-def match(before, after, motion, settings=None, heading_sigma=None, inverse_depth=None):
+def match(before, after, motion, use_colour=True, heading_sigma=HEADING_SIGMA, inverse_depth=None):
     """Match the `Lines` of two frames one-to-one: pairs of indices, int [m, 2].
 
     `motion`: pose (x, y, heading) [3] of the sensor at `after` in its frame at `before`, or one per
     line [n, 3]. `heading_sigma` rad: standard deviation of its heading, a number or [n].
     `inverse_depth` [n, 2] 1/m: least and largest of the lines of `before`, as far as known.
+    `use_colour`: compare appearances, not only bearings.
     """
-    settings = MatchSettings() if settings is None else settings
-    appearances = None
-    if settings.use_colour:
-        appearances = (appearance_of(before), appearance_of(after))
-    return match_bearings(
-        (before.bearing, after.bearing),
-        (before.sigma, after.sigma),
-        motion,
-        appearances,
-        settings,
-        heading_sigma,
-        inverse_depth,
-    )
+    lines = before, after
+    appearances = tuple(map(appearance_of, lines)) if use_colour else None
+    bearings, sigmas = ([getattr(part, name) for part in lines] for name in ("bearing", "sigma"))
+    return match_bearings(bearings, sigmas, motion, appearances, heading_sigma, inverse_depth)
 
 
 def appearance_of(lines):
@@ -75,33 +53,25 @@ def appearance_of(lines):
 
 
 def match_bearings(
-    bearings,
-    sigmas,
-    motion,
-    appearances=None,
-    settings=None,
-    heading_sigma=None,
-    inverse_depth=None,
+    bearings, sigmas, motion, appearances=None, heading_sigma=HEADING_SIGMA, inverse_depth=None
 ):
     """`match` of arrays: pairs (before, after) of bearings [n] rad, standard deviations [n] and
     `Appearance` (None: only bearings count)."""
-    settings = MatchSettings() if settings is None else settings
-    heading_sigma = settings.heading_sigma if heading_sigma is None else heading_sigma
     first, second = (np.asarray(b, float) for b in bearings)
     if len(first) == 0 or len(second) == 0:
         return np.empty((0, 2), int)
     motion = np.broadcast_to(np.asarray(motion, float), (len(first), 3))
-    cost = _angle_cost(first, second, sigmas, motion, heading_sigma, inverse_depth, settings)
+    cost = _angle_cost(first, second, sigmas, motion, heading_sigma, inverse_depth)
     if appearances is not None:
-        cost = cost + _elevation_cost(*appearances, settings) + _polarity_cost(*appearances)
-        cost = cost + _colour_cost(*appearances, cost, settings)
-    return assign_pairs(cost, settings.unmatched)
+        cost = cost + _elevation_cost(*appearances) + _polarity_cost(*appearances)
+        cost = cost + _colour_cost(*appearances, cost)
+    return assign_pairs(cost, UNMATCHED)
 
 
-def _angle_cost(first, second, sigmas, motion, heading_sigma, inverse_depth, settings):
+def _angle_cost(first, second, sigmas, motion, heading_sigma, inverse_depth):
     """Cost [n, m] of the change of bearing; `FORBIDDEN` beyond the gate."""
     if inverse_depth is None:
-        inverse_depth = np.tile([0.0, 1 / settings.nearest], (len(first), 1))
+        inverse_depth = np.tile([0.0, 1 / NEAREST], (len(first), 1))
     travel = np.hypot(motion[:, 0], motion[:, 1])
     # Of the motion, the parts along the ray and across it: at depth 1/q the bearing, less the
     # turn, changes by atan2(-q side, 1 - q ahead).
@@ -112,22 +82,22 @@ def _angle_cost(first, second, sigmas, motion, heading_sigma, inverse_depth, set
     change = second[None, :] - (first - motion[:, 2])[:, None]
     change = (change + np.pi) % (2 * np.pi) - np.pi
     # An error of the distance, along or across, turns near lines more.
-    uncertain = settings.travel_sigma * travel * np.minimum(inverse_depth[:, 1], 1.0)
+    uncertain = TRAVEL_SIGMA * travel * np.minimum(inverse_depth[:, 1], 1.0)
     variance = np.square(sigmas[0])[:, None] + np.square(sigmas[1])[None, :]
     sigma = np.sqrt(variance + (np.square(heading_sigma) + np.square(uncertain))[:, None])
     outside = np.maximum(np.maximum(low - change, change - high), 0) / sigma
     # A line at the typical depth turns by `usual`; larger changes are less likely.
-    usual = np.hypot(np.abs(side)[:, None] / settings.typical_depth, sigma)
+    usual = np.hypot(np.abs(side)[:, None] / TYPICAL_DEPTH, sigma)
     cost = outside**2 / 2 + np.minimum((change / usual) ** 2 / 4, 3.0)
-    return np.where(outside <= settings.gate, cost, FORBIDDEN)
+    return np.where(outside <= GATE, cost, FORBIDDEN)
 
 
-def _elevation_cost(before, after, settings):
+def _elevation_cost(before, after):
     """Cost [n, m] of the ends' elevations, each capped: one end may have been covered."""
     total = 0.0
     for first, second in ((before.low, after.low), (before.high, after.high)):
         change = np.asarray(second, float)[None, :] - np.asarray(first, float)[:, None]
-        total = total + np.minimum((change / settings.elevation_sigma) ** 2 / 4, 2.0)
+        total = total + np.minimum((change / ELEVATION_SIGMA) ** 2 / 4, 2.0)
     return total
 
 
@@ -137,7 +107,7 @@ def _polarity_cost(before, after):
     return 4.0 * differs
 
 
-def _colour_cost(before, after, cost, settings):
+def _colour_cost(before, after, cost):
     """Cost [n, m] of colours, after the gain of the light. Each side is capped separately, since
     one side of an edge may be a distant background."""
     first = np.asarray(before.colour, float)
@@ -146,7 +116,7 @@ def _colour_cost(before, after, cost, settings):
     dark = np.minimum(gain, 1.0)  # compare in the light of the darker frame: noise is not amplified
     difference = second[None, :] * (dark / gain) - first[:, None] * dark
     level = np.maximum(second[None, :] * (dark / gain), first[:, None] * dark)
-    sigma = DARK_SIGMA + settings.colour_sigma * level.mean(axis=-1, keepdims=True)
+    sigma = DARK_SIGMA + COLOUR_SIGMA * level.mean(axis=-1, keepdims=True)
     per_side = np.mean((difference / sigma) ** 2, axis=-1)
     return np.minimum(per_side, 5.0).sum(axis=-1)
 
