@@ -88,8 +88,8 @@ def stack_logs(logs, config, params):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *made)
 
 
-@partial(jax.jit, static_argnames=("config", "names", "estimator"))
-def scores(free, params, data, which, keys, config, names, discount, estimator="fisher"):
+@partial(jax.jit, static_argnames=("config", "names"))
+def scores(free, params, data, which, keys, config, names, discount):
     """`likelihood.Score` of items [I]: log `which` [I] of `data` with `keys` [I], at `free` [P] or,
     one for each, [I, P]; derivatives on the free scale. Spread over all devices, one after another
     on each."""
@@ -102,7 +102,7 @@ def scores(free, params, data, which, keys, config, names, discount, estimator="
         if not names:
             value = likelihood.value(given, mine, key, config)
             return likelihood.Score(jnp.zeros(0), value, None, None, None)
-        found = likelihood.score_and_value(given, mine, key, config, names, estimator, discount)
+        found = likelihood.score_and_value(given, mine, key, config, names, discount)
         by_free = jax.vmap(jnp.multiply, (-1, 0), -1)
         slope = jnp.stack([jax.grad(partial(from_free, n))(at[i]) for i, n in enumerate(names)])
         return found._replace(total=by_free(found.total, slope), steps=by_free(found.steps, slope))

@@ -34,7 +34,6 @@ from jaxslam.models import motion
 from jaxslam.models.sensors import Measurements
 from jaxslam.parameters import ALTERNATIVES, MOTION, Params, learned_by
 
-ESTIMATORS = ("fisher", "pathwise", "plain")
 DISCOUNT = 0.97
 BIASED = (
     "association 'maximum_likelihood' biases the score: noise comes out too small where landmarks "
@@ -57,8 +56,8 @@ class Score(NamedTuple):
     """Derivatives of the log likelihood by P parameters, and the likelihood.
 
     `total` [P] and `log_likelihood` []: of the whole log. `steps` [T, P] and `log_evidence` [T]:
-    the terms of every step (they sum to the total but for `fisher` with discount 1 and `pathwise`,
-    which are taken at the end). `min_ess` []: least effective sample size.
+    the terms of every step (they sum to the total but for discount 1, where it is taken at the
+    end). `min_ess` []: least effective sample size.
     """
 
     total: jax.Array
@@ -101,21 +100,20 @@ def log_likelihood(
     log: Log | Data,
     key: jax.Array,
     config: Config,
-    estimator: str = "fisher",
     discount: float | jax.Array = DISCOUNT,
 ) -> jax.Array:
     """Estimate of the log likelihood of a `Log` or `Data`, with a derivative by `params`.
 
-    `jax.grad` gives the `estimator` chosen, for `Params` or any values put into them. It is no
+    `jax.grad` gives the Fisher score (`score`), for `Params` or any values put into them. It is no
     derivative of the value returned: that one jumps. Derivatives by what `learnable` does not name
     are zero. The value includes, besides the filter's evidence, the probability of as few new
-    landmarks as there were (`frame_terms`). Raises `ValueError` for an estimator that is not there.
+    landmarks as there were (`frame_terms`).
     """
-    check(config, estimator)
+    check(config)
     data = log if isinstance(log, Data) else data_from_log(log, config)
     numbers = Params(*(jnp.asarray(value, data.start_pose.dtype) for value in params))
     discount = jnp.asarray(discount, data.start_pose.dtype)
-    return _differentiable(config, estimator, numbers, discount, data, key)
+    return _differentiable(config, numbers, discount, data, key)
 
 
 def score(
@@ -124,27 +122,22 @@ def score(
     key: jax.Array,
     config: Config,
     names: Sequence[str],
-    estimator: str = "fisher",
     discount: float = DISCOUNT,
 ) -> Score:
     """`Score` of a `Log` or `Data` by the parameters `names`, of which `learnable` has the list.
 
-    `estimator`: `fisher`, along frozen paths; with `discount` 1 its expectation, weighted with the
-    likelihood estimates, is exactly the likelihood's derivative. `pathwise`: paths move with the
-    parameters, weights keep their derivative through resampling. `plain`: what automatic
-    differentiation of the filter gives, biased; for comparison. `discount` is `fisher`'s alone.
-    Raises `ValueError` for names that have no derivative.
+    With `discount` 1 its expectation, weighted with the likelihood estimates, is exactly the
+    likelihood's derivative. Raises `ValueError` for names that have no derivative.
     """
-    check(config, estimator, names)
+    check(config, names)
     data = log if isinstance(log, Data) else data_from_log(log, config)
     numbers = Params(*(jnp.asarray(value, data.start_pose.dtype) for value in params))
-    return score_and_value(numbers, data, key, config, tuple(names), estimator, discount)
+    return score_and_value(numbers, data, key, config, tuple(names), discount)
 
 
-def check(config, estimator="fisher", names=()):
-    """Raise `ValueError` for what is not there; warn of an association that biases the score."""
-    if estimator not in ESTIMATORS:
-        raise ValueError(f"estimator: {estimator!r} is not one of {', '.join(ESTIMATORS)}")
+def check(config, names=()):
+    """Raise `ValueError` for names without a derivative; warn of an association that biases the
+    score."""
     allowed = learnable(config)
     for name in names:
         if name not in allowed:
@@ -156,12 +149,12 @@ def check(config, estimator="fisher", names=()):
         warnings.warn(BIASED, stacklevel=3)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _differentiable(config, estimator, params, discount, data, key):
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _differentiable(config, params, discount, data, key):
     return value(params, data, key, config)
 
 
-def _derivative(config, estimator, primals, tangents):
+def _derivative(config, primals, tangents):
     params, discount, data, key = primals
     moved = [
         name
@@ -169,7 +162,7 @@ def _derivative(config, estimator, primals, tangents):
         if not isinstance(tangent, jax.custom_derivatives.SymbolicZero)
     ]
     names = tuple(name for name in learnable(config) if name in moved)
-    found = score_and_value(params, data, key, config, names, estimator, discount)
+    found = score_and_value(params, data, key, config, names, discount)
     along = [getattr(tangents[0], name) * found.total[i] for i, name in enumerate(names)]
     return found.log_likelihood, sum(along, jnp.zeros_like(found.log_likelihood))
 
@@ -223,12 +216,11 @@ def frame_terms(measurements, params):
 
 
 class _Carry(NamedTuple):
-    """State; derivatives by the parameters (first axis) of every particle's pose (None: held
-    still), its landmarks and its log weight, as inherited; sums of the steps' scores and of what
-    all particles share of them; least effective sample size."""
+    """State; derivatives by the parameters (first axis) of every particle's landmarks and of its
+    log weight, as inherited; sums of the steps' scores and of what all particles share of them;
+    least effective sample size."""
 
     state: fastslam.State
-    pose: jax.Array | None
     world: dict
     inherited: jax.Array
     total: jax.Array
@@ -236,127 +228,101 @@ class _Carry(NamedTuple):
     ess: jax.Array
 
 
-@partial(jax.jit, static_argnames=("config", "names", "estimator"))
-def score_and_value(params, data, key, config, names, estimator="fisher", discount=DISCOUNT):
+@partial(jax.jit, static_argnames=("config", "names"))
+def score_and_value(params, data, key, config, names, discount=DISCOUNT):
     """`score` of `Data`, unchecked, for use inside other compiled programs."""
-    frozen = estimator == "fisher"
     # Derivatives are resampled along with the landmarks; where these lie makes no difference.
     config = dataclasses.replace(config, lazy=False)
     start, key = jax.random.split(key)
     state = _initial_state(data, start, config)
-    through = _filter_through(names, config, data.measurements, frozen)
-    zero = jnp.zeros((len(through), *state.pose.shape), state.pose.dtype)
+    through = _filter_through(names, config, data.measurements)
+    dtype = state.pose.dtype
     carry = _Carry(
         state,
-        None if frozen else zero,
-        {name: jnp.zeros((len(through), *getattr(state.landmarks, name).shape), zero.dtype)
-         for name in _parts(through, config, frozen)},
-        jnp.zeros((len(names), config.particles), zero.dtype),
-        jnp.zeros(len(names), zero.dtype),
-        jnp.zeros(len(names), zero.dtype),
-        jnp.asarray(config.particles, zero.dtype),
+        {name: jnp.zeros((len(through), *getattr(state.landmarks, name).shape), dtype)
+         for name in _parts(through, config)},
+        jnp.zeros((len(names), config.particles), dtype),
+        jnp.zeros(len(names), dtype),
+        jnp.zeros(len(names), dtype),
+        jnp.asarray(config.particles, dtype),
     )  # fmt: skip
 
     def step(carry, frame):
-        return _step(carry, frame, params, key, config, names, through, estimator, discount)
+        return _step(carry, frame, params, key, config, names, through, discount)
 
     looks = data.odometry, data.measurements
     last, (steps, log_evidence) = jax.lax.scan(step, carry, looks)
     weight = jnp.exp(last.state.log_weight)
     at_end = last.inherited @ weight + last.shared
-    whole = discount == 1 if frozen else estimator == "pathwise"
-    total = jnp.where(whole, at_end, last.total)
+    total = jnp.where(discount == 1, at_end, last.total)
     return Score(total, log_evidence.sum(), steps, log_evidence, last.ess)
 
 
-def _filter_through(names, config, measurements, frozen):
-    """Those of the names whose derivatives go through poses or landmarks."""
-    if not frozen:
-        return names
+def _filter_through(names, config, measurements):
+    """Those of the names whose derivatives go through landmarks."""
     sensor = learned_by(config.sensor)
     if measurements.scale is not None:
         sensor = (*sensor, "gain_tran")
     return tuple(name for name in names if name in sensor)
 
 
-def _parts(through, config, frozen):
-    """Arrays of the map that have derivatives: an anchor moves with poses and mounting only."""
+def _parts(through, config):
+    """Arrays of the map that have derivatives: an anchor moves with the mounting only."""
     if not through:
         return ()
-    anchored = config.sensor == "bearing" and (not frozen or {"mount_x", "mount_y"} & {*through})
+    anchored = config.sensor == "bearing" and {"mount_x", "mount_y"} & {*through}
     return ("mean", "factor", "anchor") if anchored else ("mean", "factor")
 
 
-def _step(carry, frame, params, key, config, names, through, estimator, discount):
+def _step(carry, frame, params, key, config, names, through, discount):
     """A filter step that takes the derivatives along."""
-    frozen = estimator == "fisher"
     state, (odometry, measurements) = carry.state, frame
     chance = draw_for_frame(key, state.step, config)
-    seen, pose_dot, world_dot, by_density = _look(
-        carry, chance, frame, params, config, through, frozen
-    )
+    seen, world_dot, by_density = _look(carry, chance, frame, params, config, through)
     gained = dict(zip(through, by_density, strict=True))
-    if frozen:
-        drawn = motion_score(
-            seen.u, odometry, params, [n for n in names if n in learned_by(MOTION)]
-        )
-        told = alternatives_score(seen.match, params)
-        for name, more in {**drawn, **{n: told[n] for n in names if n in told}}.items():
-            gained[name] = gained[name] + more if name in gained else more
-    after, info = fastslam.weigh_and_resample(chance, state, seen, measurements, config)
+    drawn = motion_score(seen.u, odometry, params, [n for n in names if n in learned_by(MOTION)])
+    told = alternatives_score(seen.match, params)
+    for name, more in {**drawn, **{n: told[n] for n in names if n in told}}.items():
+        gained[name] = gained[name] + more if name in gained else more
+    after, info = fastslam.conclude(chance, state, seen, measurements, config)
     before, weight = jnp.exp(state.log_weight), jnp.exp(info.log_weight)
-    keep = discount if frozen else 1.0
-    inherited = keep * carry.inherited
+    inherited = discount * carry.inherited
     own = inherited + jnp.stack([gained[name] for name in names]) if names else inherited
     # What has no weight has no say, not even as 0 times NaN.
     own = jnp.where(weight > 0, own, 0.0)
     extra = _frame_score(measurements, params, names)
     gradient = own @ weight - inherited @ before + extra
-    # Plain differentiation takes the weights after resampling for constants.
-    own_after = jnp.where(info.resampled, 0.0, own) if estimator == "plain" else own
-    pose_dot, world_dot, own_after = resampling.gather(
-        (pose_dot, world_dot, own_after), info.ancestors, info.resampled, config
-    )
+    world_dot, own = resampling.gather((world_dot, own), info.ancestors, info.resampled, config)
     log_evidence = info.log_evidence + frame_terms(measurements, params)
     sums = carry.total + gradient, carry.shared + extra, jnp.minimum(carry.ess, info.ess)
-    return _Carry(after, pose_dot, world_dot, own_after, *sums), (gradient, log_evidence)
+    return _Carry(after, world_dot, own, *sums), (gradient, log_evidence)
 
 
-def _look(carry, chance, frame, params, config, through, frozen):
-    """`Observed` of the particles, and its derivatives: pose, map, density, by `through`."""
+def _look(carry, chance, frame, params, config, through):
+    """`Observed` of the particles, and its derivatives: map, density, by `through`."""
     state = carry.state
     parts = tuple(carry.world)
 
-    def look(values, pose, arrays):
-        world = state.landmarks._replace(**arrays)
+    def look(values, arrays):
         given = params._replace(**dict(zip(through, values, strict=True)))
-        moved = state._replace(pose=pose, landmarks=world)
-        seen = blocks.observe(moved, chance, *frame, given, config, frozen=frozen)
-        moved = None if frozen else seen.pose
-        return (moved, {name: getattr(seen.landmarks, name) for name in parts}, seen.density), seen
+        moved = state._replace(landmarks=state.landmarks._replace(**arrays))
+        seen = blocks.observe(moved, chance, *frame, given, config, frozen=True)
+        return ({name: getattr(seen.landmarks, name) for name in parts}, seen.density), seen
 
     values = tuple(getattr(params, name) for name in through)
     arrays = {name: getattr(state.landmarks, name) for name in parts}
     if not through:
-        seen = look(values, state.pose, arrays)[1]
-        return seen, carry.pose, {}, ()
+        return look(values, arrays)[1], {}, ()
 
-    def push(direction, pose_dot, world_dot):
-        direction = tuple(direction)
-        if frozen:
-            return jax.jvp(
-                lambda v, a: look(v, state.pose, a),
-                (values, arrays), (direction, world_dot), has_aux=True,
-            )  # fmt: skip
-        return jax.jvp(
-            look, (values, state.pose, arrays), (direction, pose_dot, world_dot), has_aux=True
-        )
+    def push(direction, world_dot):
+        tangents = tuple(direction), world_dot
+        return jax.jvp(look, (values, arrays), tangents, has_aux=True)
 
     basis = jnp.eye(len(through), dtype=state.pose.dtype)
-    _, (pose_dot, world_dot, by_density), seen = jax.vmap(
-        push, in_axes=(0, None if frozen else 0, 0), out_axes=(None, 0, None)
-    )(basis, carry.pose, carry.world)
-    return seen, pose_dot, world_dot, by_density
+    _, (world_dot, by_density), seen = jax.vmap(push, in_axes=0, out_axes=(None, 0, None))(
+        basis, carry.world
+    )
+    return seen, world_dot, by_density
 
 
 def motion_score(u, odometry, params, names):
