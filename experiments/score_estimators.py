@@ -47,7 +47,7 @@ def _log_evidence(params, data, key, config, names, keep, values):
     def step(state, frame):
         chance = likelihood.draw_for_frame(key, state.step, config)
         seen = blocks.observe(state, chance, *frame, params, config)
-        after, info = fastslam.conclude(chance, *hold((state, seen)), frame[1], config)
+        after, info = fastslam.weigh_and_resample(chance, *hold((state, seen)), frame[1], config)
         log_weight = state.log_weight + seen.density
         # What has no weight has no say, not even as 0 times NaN.
         alive = jnp.exp(info.log_weight) > 0

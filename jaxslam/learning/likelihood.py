@@ -284,7 +284,7 @@ def _step(carry, frame, params, key, config, names, through, discount):
     told = alternatives_score(seen.match, params)
     for name, more in {**drawn, **{n: told[n] for n in names if n in told}}.items():
         gained[name] = gained[name] + more if name in gained else more
-    after, info = fastslam.conclude(chance, state, seen, measurements, config)
+    after, info = fastslam.weigh_and_resample(chance, state, seen, measurements, config)
     before, weight = jnp.exp(state.log_weight), jnp.exp(info.log_weight)
     inherited = discount * carry.inherited
     own = inherited + jnp.stack([gained[name] for name in names]) if names else inherited
