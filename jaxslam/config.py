@@ -103,20 +103,17 @@ class Config:
 
     def _check_combinations(self):
         if self.descriptors and self.association == "known":
-            raise ValueError(
-                "Config.descriptors: identities are known, so appearance decides nothing; take 0"
-            )
+            rule = "identities are known, so appearance decides nothing"
+            raise ValueError(f"Config.descriptors: {rule}")
         if self.particles % self.devices:
             even = self.particles // self.devices * self.devices
             raise ValueError(
                 f"Config.devices: {self.particles} particles are not shared evenly by "
-                f"{self.devices}; take {even or self.devices} or {even + self.devices} particles"
+                f"{self.devices}; {even or self.devices} or {even + self.devices} are"
             )
         if self.uniform_association_prior and self.association != "sampled":
-            raise ValueError(
-                "Config.uniform_association_prior: is for association sampled, not "
-                f"{self.association}"
-            )
+            rule = f"is for association sampled, not {self.association}"
+            raise ValueError(f"Config.uniform_association_prior: {rule}")
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Config":

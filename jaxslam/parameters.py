@@ -237,9 +237,9 @@ def current_names(values):
     return {FORMER_NAMES.get(name, name): value for name, value in values.items()}
 
 
-def learned_by(whose):
+def learned_by(likelihood):
     """List the parameters on which a likelihood depends, in their order."""
-    return tuple(row.name for row in PARAMETERS if whose in row.learned_by)
+    return tuple(row.name for row in PARAMETERS if likelihood in row.learned_by)
 
 
 def default_params(sensor: str = "range_bearing", log: "Log | None" = None) -> "Params":

@@ -6,6 +6,7 @@ formats, `mat5` MATLAB files. Nothing heavy is imported before a file is read: `
 """
 
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,9 +17,9 @@ if TYPE_CHECKING:
 class Format(NamedTuple):
     """A format that can be read.
 
-    `name` for messages; `detects(paths)`: whether a list of existing paths is in this format;
-    `read(paths, robot)`: the `Log`; `help`: what the files hold, and their option; `robots`:
-    whether `robot` chooses one of several.
+    `name` for messages; `detects(path)`: whether a path is in this format; `read(path)`: the `Log`;
+    `help`: what the files hold. `robots`: `read(path, robot)` chooses one of several robots;
+    `several`: `read(paths)` reads a list.
     """
 
     name: str
@@ -26,6 +27,7 @@ class Format(NamedTuple):
     read: Callable
     help: str
     robots: bool = False
+    several: bool = False
 
 
 def read(paths: str | Path | Sequence[str | Path], robot: int | None = None) -> "Log":
@@ -40,15 +42,17 @@ def read(paths: str | Path | Sequence[str | Path], robot: int | None = None) -> 
     if not paths:
         raise ValueError(f"nothing to read: give {allowed}")
     for path in paths:
-        if not path.exists() and not _is_log([path]):
+        if not path.exists() and not _is_log(path):
             raise ValueError(f"{path}: no such file or folder")
-    found = next((row for row in FORMATS if row.detects(paths)), None)
+    fits = (row for row in FORMATS if row.several or len(paths) == 1)
+    found = next((row for row in fits if all(map(row.detects, paths))), None)
     if robot is not None and not (found and found.robots):
         raise ValueError(f"{paths[0]}: only an MRCLAM folder has robots to choose from")
     if found is None:
         raise ValueError(f"{', '.join(map(str, paths))}: format not known; give {allowed}")
     try:
-        return found.read(paths, robot)
+        source = paths if found.several else paths[0]
+        return found.read(source, *([robot] if found.robots else []))
     except OSError as err:
         raise ValueError(f"{err.filename or paths[0]}: cannot read ({err.strerror})") from err
     except ValueError as err:
@@ -57,63 +61,33 @@ def read(paths: str | Path | Sequence[str | Path], robot: int | None = None) -> 
         raise ValueError(f"{paths[0]}: {err}") from err  # what `Log` refuses names no file
 
 
-def _is_mrclam(paths):
-    return len(paths) == 1 and (paths[0] / "Barcodes.dat").exists()
+def _import_later(module, name):
+    """A function that imports the reader `name` when it is called."""
+    return lambda *given: getattr(import_module(f"jaxslam.logs.{module}"), name)(*given)
 
 
-def _read_mrclam(paths, robot):
-    from jaxslam.logs.readers.mrclam import read_mrclam
-
-    return read_mrclam(paths[0], robot)
-
-
-def _is_mat(paths):
-    return len(paths) == 1 and paths[0].suffix.lower() == ".mat"
-
-
-def _read_mat(paths, robot):
-    from jaxslam.logs.readers.aer1513 import read_mat
-
-    return read_mat(paths[0])
-
-
-def _is_csv(paths):
-    return all(path.suffix.lower() == ".csv" for path in paths)
-
-
-def _read_csv(paths, robot):
-    from jaxslam.logs.readers.csv_files import read_csv
-
-    return read_csv(paths)
-
-
-def _is_log(paths):
+def _is_log(path):
     from jaxslam.logs.log_file import BUNDLED
 
-    npz = paths[0].suffix.lower() == ".npz" and paths[0].exists()
-    return len(paths) == 1 and (npz or str(paths[0]) in BUNDLED)
-
-
-def _read_log(paths, robot):
-    from jaxslam.logs.log_file import load_log
-
-    return load_log(paths[0])
+    return str(path) in BUNDLED or (path.suffix.lower() == ".npz" and path.exists())
 
 
 FORMATS = (
     Format(
-        "an MRCLAM folder (with Barcodes.dat)",
-        _is_mrclam,
-        _read_mrclam,
-        "one robot's log (--robot)",
-        robots=True,
+        "an MRCLAM folder (with Barcodes.dat)", lambda path: (path / "Barcodes.dat").exists(),
+        _import_later("readers.mrclam", "read_mrclam"), "one robot's log (--robot)", robots=True,
     ),
-    Format("a .mat file", _is_mat, _read_mat, "the course's dataset2.mat"),
     Format(
-        "two to four .csv files",
-        _is_csv,
-        _read_csv,
-        "odometry, measurements, and the truth if known",
+        "a .mat file", lambda path: path.suffix.lower() == ".mat",
+        _import_later("readers.aer1513", "read_mat"), "the course's dataset2.mat",
     ),
-    Format("a .npz log", _is_log, _read_log, "to move its frames (--time-offset)"),
-)
+    Format(
+        "two to four .csv files", lambda path: path.suffix.lower() == ".csv",
+        _import_later("readers.csv_files", "read_csv"),
+        "odometry, measurements, and the truth if known", several=True,
+    ),
+    Format(
+        "a .npz log", _is_log,
+        _import_later("log_file", "load_log"), "to move its frames (--time-offset)",
+    ),
+)  # fmt: skip
