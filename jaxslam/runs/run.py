@@ -186,7 +186,7 @@ def _rejuvenate(renewal, key, at, config):
     best = int(at.summaries[-1].survivor[-1])
     since = trace_lineage(at.tree, best) if at.tree is not None else None
     state = settle_donated(at.state, config)
-    state, past, lost = renewal.rejuvenated(key, state, at.past, since, at.done, best)
+    state, past, lost = renewal.rejuvenate(key, state, at.past, since, at.done, best)
     if lost is None:
         return at._replace(state=state, past=past)
     last = at.summaries[-1]

@@ -75,7 +75,7 @@ class Rejuvenator:
                     data, log.start_pose - origin, log.start_cov, params, config.sensor
                 )
 
-    def rejuvenated(self, key, state, past, lineage, done, best):
+    def rejuvenate(self, key, state, past, lineage, done, best):
         """`State` after `done` frames drawn anew, the new `Past`, and landmarks lost for want of a
         slot (None: it failed, and state and past are as they were); `lineage`: of the particle
         `best`, since the last time (None: of another process). The state given is settled
