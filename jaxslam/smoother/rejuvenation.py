@@ -99,11 +99,7 @@ class Rejuvenator:
         appearances = state.appearances
         for leaf in jax.tree.leaves(state._replace(appearances=None)):  # no two maps at once
             leaf.delete()
-        return (
-            posterior_sampling.draw_state(key, joint, done, self._config, appearances),
-            past,
-            lost,
-        )
+        return posterior_sampling.draw_state(key, joint, done, self._config, appearances), past, lost
 
     def _looked_back(self, past, lineage, done, young):
         """The new `Past`, `redraw.Joint` and how many landmarks it has no slot for."""

@@ -88,9 +88,7 @@ def backwards(params, data, config, names, discount):
             seen = blocks.observe(state, chance, *frame, given, config, True)
             drawn = motion.log_density(hold(seen.pose), hold(state.pose), frame[0], given)
             own = discount * inherited + seen.density + drawn
-            after, info = fastslam.weigh_and_resample(
-                chance, *hold((state, seen)), frame[1], config
-            )
+            after, info = fastslam.weigh_and_resample(chance, *hold((state, seen)), frame[1], config)
             before, weight = hold((jnp.exp(state.log_weight), jnp.exp(info.log_weight)))
             gain = own @ weight - discount * inherited @ before
             common = likelihood.frame_terms(frame[1], given)

@@ -176,10 +176,7 @@ def test_faults_of_toml_are_named(tmp_path, old, new, told):
         (lambda lines: lines[:-2], "image size is missing"),
         (lambda lines: [x.replace("768 1024", "768.5 1024") for x in lines], "whole number"),
         (lambda lines: [x.replace("768 1024", "768") for x in lines], "image size has 1 number"),
-        (
-            lambda lines: [x.replace("5 -", "6 -") for x in lines],
-            "announces 6 coefficients but has 5",
-        ),
+        (lambda lines: [x.replace("5 -", "6 -") for x in lines], "announces 6 coefficients but has 5"),
         (lambda lines: [x.replace("768 1024", "high wide") for x in lines], "is high wide"),
     ],
 )
