@@ -90,7 +90,7 @@ def run(
         estimate_memory(config, len(data.time)), config
     )  # before compiling, which takes long
     if checkpoints:
-        checkpoints.begin(log, config, params, seed)
+        checkpoints.check_fingerprint(log, config, params, seed)
 
     total, key = len(data.time), jax.random.key(seed)
     at, steps, compile_seconds = (
@@ -109,7 +109,7 @@ def run(
         if not at:
             capacity.check_memory(need, config)
     if checkpoints:
-        checkpoints.claim()
+        checkpoints.take_over_folder()
     if not at:
         state = initial_state(log, config, key)
         at = RunProgress(state, [], Tree() if sharding.is_leader() else None, 0, 0.0, None, [])
@@ -151,7 +151,7 @@ def _filter(steps, key, at, data, params, config, renewal, progress, checkpoints
     """`Filtered` at the end: from where it is `at`, the compiled `steps` over all chunks."""
     total, start, begin = len(data.time), at.done, time.perf_counter() - at.seconds
     session = time.perf_counter()
-    with checkpoints.watching() if checkpoints else nullcontext():
+    with checkpoints.catch_signals() if checkpoints else nullcontext():
         for count, chunk in split_into_chunks(data, config, at.done, renewal.due):
             if at.done in renewal.due:
                 at = _rejuvenate(renewal, key, at, config)
@@ -174,7 +174,7 @@ def _filter(steps, key, at, data, params, config, renewal, progress, checkpoints
             if progress:
                 progress(at.done, total, line)
             if checkpoints:
-                checkpoints.reached(at, total, line)
+                checkpoints.save_if_due(at, total, line)
     return at
 
 

@@ -245,8 +245,8 @@ def test_it_goes_on_from_a_checkpoint_with_the_same_bits(log, found, tmp_path):
     from jaxslam.runs import checkpoints
 
     class Stopped(checkpoints.Checkpoints):
-        def reached(self, at, total, line):
-            super().reached(at, total, line)
+        def save_if_due(self, at, total, line):
+            super().save_if_due(at, total, line)
             if at.done >= total // 2:
                 raise KeyboardInterrupt
 
