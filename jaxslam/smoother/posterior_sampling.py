@@ -20,7 +20,7 @@ from jaxslam.filter.xla import barrier
 from jaxslam.models.geometry import norm, wrap
 
 STREAM = 2**31 - 2  # sets these random numbers apart from those of the steps
-NONE, POINT, YOUNG = 0, 1, 2  # kinds of a slot
+NONE, POINT, UNKNOWN_DEPTH = 0, 1, 2  # kinds of a slot
 
 
 class Joint(NamedTuple):
@@ -69,12 +69,12 @@ def covariance(fit):
     part of the inverse and S = B A^-1 B' = C - P^-1: a path's error d has the covariance
     A^-1 + A^-1 B' P B A^-1, and moves the points' means by -C^-1 B d.
     """
-    chain, reach, points = fit.factor
+    chain, inverse_border, points = fit.factor
     size = len(fit.points)
-    last = np.zeros((len(reach), 3))
+    last = np.zeros((len(inverse_border), 3))
     last[-3:] = np.eye(3)
     own = cho_solve_banded((chain, True), last, check_finite=False)[-3:]
-    end = reach[-3:]
+    end = inverse_border[-3:]
     block = np.arange(2 * size).reshape(size, 2)
     corner, inverse = np.zeros((2, 2 * size, 2 * size))
     corner[block[:, :, None], block[:, None, :]] = fit.information
@@ -111,7 +111,7 @@ def _draw(key, joint, step, known, config):
     off = jax.lax.fori_loop(0, joint.used, more, jnp.zeros((len(joint.root), n), float))
     pose = joint.pose[:, None] + off[:3]
     pose = barrier(pose.at[2].set(wrap(pose[2])))
-    world = _map(joint, pose, off[3:].reshape(slots, 2, n), config)
+    world = _draw_landmarks(joint, pose, off[3:].reshape(slots, 2, n), config)
     state = fresh_state(pose, world, step, candidate_slots.bounds_of(world), config)
     return (
         state
@@ -120,7 +120,7 @@ def _draw(key, joint, step, known, config):
     )
 
 
-def _map(joint, pose, off, config):
+def _draw_landmarks(joint, pose, off, config):
     """`Landmarks` of particles at `pose` [3, N] whose points are `off` [M, 2, N] from the means."""
     shape = config.landmarks, config.particles
     kind = joint.kind[:, None]
@@ -129,8 +129,8 @@ def _map(joint, pose, off, config):
     anchor = None
     if config.sensor == "bearing":
         anchor = jnp.broadcast_to(joint.anchor[:, :, None], (2, *shape))
-        ray, narrow = _from_point(mean - anchor, factor)
-        carried, place = _carried(mean, anchor, pose)
+        ray, narrow = _to_inverse_depth(mean - anchor, factor)
+        carried, place = _to_world(mean, anchor, pose)
         mean = jnp.where(kind == POINT, ray, carried)
         factor = jnp.where(kind == POINT, narrow, factor)
         anchor = jnp.where(kind == POINT, anchor, place)
@@ -145,7 +145,7 @@ def _map(joint, pose, off, config):
     )
 
 
-def _from_point(away, factor):
+def _to_inverse_depth(away, factor):
     """Direction and inverse depth of points [2, M, N] as seen from their anchors, to first order,
     with the lower factor."""
     r = norm(away[0], away[1])
@@ -160,7 +160,7 @@ def _from_point(away, factor):
     return jnp.stack([jnp.arctan2(away[1], away[0]), 1 / r]), jnp.stack([top, side, low])
 
 
-def _carried(mean, anchor, pose):
+def _to_world(mean, anchor, pose):
     """Directions and anchors as seen from the robot, in the world."""
     x, y, heading = pose
     c, s = jnp.cos(heading), jnp.sin(heading)

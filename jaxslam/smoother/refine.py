@@ -79,14 +79,14 @@ def refine(
     _check("landmark_id", landmark_id, shape)
     identity = np.asarray(frames.measurements.identity).ravel()
     with jax.enable_x64(True):
-        params = params if known else is_doubtful(params)
-        given, place = least_squares.make_problem(frames, start_pose, start_cov, params, sensor)
-        name = identity[place] if known else np.asarray(landmark_id).ravel()[place]
-        found = solve_and_reassociate(given, place, pose, name, known, progress=progress)
-    return _to_refined(found, given, place, shape, identity if known else None)
+        params = params if known else allow_mistakes(params)
+        problem, flat_index = least_squares.make_problem(frames, start_pose, start_cov, params, sensor)
+        name = identity[flat_index] if known else np.asarray(landmark_id).ravel()[flat_index]
+        found = solve_and_reassociate(problem, flat_index, pose, name, known, progress=progress)
+    return _to_refined(found, problem, flat_index, shape, identity if known else None)
 
 
-def is_doubtful(params):
+def allow_mistakes(params):
     """The parameters where identities are hidden: a measurement may be of something else, even of a
     sensor that has no clutter."""
     return params._replace(outlier=max(float(params.outlier), MISTAKEN))
@@ -99,49 +99,49 @@ def _check(name, value, shape):
         raise ValueError(f"{name}: not all finite")
 
 
-def _groups(name, place, known):
-    """`Groups` of measurements at `place` by name: identities, or births (-1: its own place)."""
+def _group_measurements(name, flat_index, known):
+    """`Groups` of measurements at `flat_index` by name: identities, or births (-1: its own place)."""
     none = name < 0 if known else (name == -2) | (name == -3)
-    name = np.where(name == -1, place, name)
+    name = np.where(name == -1, flat_index, name)
     label, first, of = np.unique(name[~none], return_index=True, return_inverse=True)
     group = np.full(len(name), -1)
     group[~none] = of
-    label = place[~none][first] if known else label
+    label = flat_index[~none][first] if known else label
     return reassociation.Groups(group, label, np.full((len(label), 2), np.nan))
 
 
-def _reobserve(groups):
+def _drop_single_measurements(groups):
     """`Groups` without those of one measurement, which tell nothing of the path: where much is
     clutter, or the map was full, they are far more than the rest, and matrices of all of them would
     not fit."""
-    again = np.bincount(groups.of[groups.of >= 0], minlength=len(groups.label)) > 1
+    again = np.bincount(groups.assignment[groups.assignment >= 0], minlength=len(groups.landmark_id)) > 1
     number = np.append(np.where(again, np.cumsum(again) - 1, -1), -1)
-    return reassociation.Groups(number[groups.of], groups.label[again], groups.point[again])
+    return reassociation.Groups(number[groups.assignment], groups.landmark_id[again], groups.point[again])
 
 
-def solve_and_reassociate(given, place, pose, name, known, again=False, progress=None):
+def solve_and_reassociate(problem, flat_index, pose, name, known, again=False, progress=None):
     """Solve and check again until nothing changes: `Solved`.
 
-    `place` [M]: of the measurements, as `bundle.problem` has it; `pose` [T, 3]; `name` [M]: their
+    `flat_index` [M]: of the measurements, as `bundle.problem` has it; `pose` [T, 3]; `name` [M]: their
     identities if they are `known`, else their landmarks' births. `again`: most of it was refined
     before and will be again, so fewer rounds will do, and landmarks may yet earn their place.
     """
     widths, most = (NARROW, ROUNDS_AGAIN) if again else (WIDE, ROUNDS)
-    groups = _groups(name, place, known)
-    if not known and len(pose) * len(groups.label) > LARGE:
-        groups = _reobserve(groups)
-    path = np.vstack([given.start, pose]).astype(float)
+    groups = _group_measurements(name, flat_index, known)
+    if not known and len(pose) * len(groups.landmark_id) > LARGE:
+        groups = _drop_single_measurements(groups)
+    path = np.vstack([problem.start, pose]).astype(float)
     done, iterations, merged = 0, 0, []
-    tries = np.full(len(groups.label), TRIES)
-    groups = _locate(given, path, groups, tries)
+    tries = np.full(len(groups.landmark_id), TRIES)
+    groups = _locate(problem, path, groups, tries)
     while True:
-        rows, which = reassociation.in_field_of_view(groups)
-        fit = least_squares.solve(given, path, groups.point[rows], which, widths, progress)
+        rows, which = reassociation.index_mapped(groups)
+        fit = least_squares.solve(problem, path, groups.point[rows], which, widths, progress)
         path, done, iterations = fit.path, done + 1, iterations + fit.iterations
         groups.point[rows] = fit.points
-        after, pairs = reassociation.check_groups(given, fit, groups, known, not again)
-        after = _locate(given, path, after, tries)
-        settled = np.array_equal(after.of, groups.of) and np.array_equal(
+        after, pairs = reassociation.check_groups(problem, fit, groups, known, not again)
+        after = _locate(problem, path, after, tries)
+        settled = np.array_equal(after.assignment, groups.assignment) and np.array_equal(
             np.isfinite(after.point), np.isfinite(groups.point)
         )
         if settled or done == most:
@@ -152,58 +152,58 @@ def solve_and_reassociate(given, place, pose, name, known, again=False, progress
         groups = after
 
 
-def _locate(given, path, groups, tries):
+def _locate(problem, path, groups, tries):
     """`regroup.located` of the groups that still have a try: one whose depth is at the limit would
     come and go for ever. Counts `tries` [G] down."""
-    after = reassociation.locate(given, path, groups)
+    after = reassociation.locate(problem, path, groups)
     new = np.isfinite(after.point[:, 0]) & ~np.isfinite(groups.point[:, 0])
     tries[new] -= 1
     return after._replace(point=np.where((new & (tries < 0))[:, None], np.nan, after.point))
 
 
-def landmark_ids(found, place, shape):
+def landmark_ids(found, flat_index, shape):
     """What each measurement was taken for [T, K] (`shape`), as `Result.landmark_id`; where the landmark
     has no depth yet, its label all the same."""
     groups = found.groups
-    _, which = reassociation.in_field_of_view(groups)
-    used = (groups.of >= 0) & ((which < 0) | (found.fit.weight > 0.5))
-    label = np.where(used, np.append(groups.label, -2)[groups.of], -2)
+    _, which = reassociation.index_mapped(groups)
+    used = (groups.assignment >= 0) & ((which < 0) | (found.fit.weight > 0.5))
+    label = np.where(used, np.append(groups.landmark_id, -2)[groups.assignment], -2)
     landmark_id = np.full(shape, -3).ravel()
-    landmark_id[place] = np.where(label == place, -1, label)
+    landmark_id[flat_index] = np.where(label == flat_index, -1, label)
     return landmark_id.reshape(shape)
 
 
-def _to_refined(found, given, place, shape, identities):
+def _to_refined(found, problem, flat_index, shape, identities):
     """`Refined` from the last round; points without an inlier or a depth are left out."""
     fit, groups = found.fit, found.groups
-    rows, which = reassociation.in_field_of_view(groups)
+    rows, which = reassociation.index_mapped(groups)
     sure = fit.weight > 0.5
     n = np.bincount(which[sure], minlength=len(rows))
     kept = n > 0
-    if given.sensor == "bearing":
-        kept &= reassociation.is_locatable(given, fit, which)
+    if problem.sensor == "bearing":
+        kept &= reassociation.has_depth(problem, fit, which)
     cov = fit.factor.points.reshape(len(rows), 2, len(rows), 2)
     every = np.arange(len(rows))
     own = cov[every, :, every][kept]
-    identity = np.full(len(groups.label), -1)
+    identity = np.full(len(groups.landmark_id), -1)
     if identities is not None:
-        identity = identities[groups.label]
+        identity = identities[groups.landmark_id]
     pose = fit.path[1:].copy()
     pose[:, 2] = (pose[:, 2] + np.pi) % (2 * np.pi) - np.pi
     return Refined(
         pose=pose,
         cov=normal_equations.pose_covariances(fit.factor)[1:],
-        id=groups.label[rows][kept],
+        id=groups.landmark_id[rows][kept],
         mean=fit.points[kept],
         landmark_cov=np.stack([own[:, 0, 0], own[:, 0, 1], own[:, 1, 1]], 1),
         n=n[kept],
         identity=identity[rows][kept],
-        landmark_id=landmark_ids(found, place, shape),
+        landmark_id=landmark_ids(found, flat_index, shape),
         rounds=found.rounds,
         iterations=found.iterations,
         cost=fit.cost,
         converged=found.converged,
         merged=len(found.merged),
-        dropped=len(groups.label) - len(found.merged) - int(kept.sum()),
+        dropped=len(groups.landmark_id) - len(found.merged) - int(kept.sum()),
         residual=fit.residual,
     )

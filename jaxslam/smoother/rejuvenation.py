@@ -68,10 +68,10 @@ class Rejuvenator:
         self.due = frozenset(due_frames(data.odometry, config.rejuvenate))
         self._config, self._known = config, config.association == "known"
         self._identity = np.asarray(data.measurements.identity).ravel()
-        params = params if self._known else refine.is_doubtful(params)
+        params = params if self._known else refine.allow_mistakes(params)
         if self.due and sharding.is_leader():
             with jax.enable_x64(True):
-                self._given, self._place = least_squares.make_problem(
+                self._problem, self._flat_index = least_squares.make_problem(
                     data, log.start_pose - origin, log.start_cov, params, config.sensor
                 )
 
@@ -80,7 +80,7 @@ class Rejuvenator:
         slot (None: it failed, and state and past are as they were); `lineage`: of the particle
         `best`, since the last time (None: of another process). The state given is settled
         (`filter.settled`), and is given up."""
-        young = _young(state, best, self._config)
+        young = _take_particle(state, best, self._config)
         joint, lost = (
             posterior_sampling.empty_joint(self._config.landmarks)._replace(used=np.int32(0)),
             0,
@@ -111,11 +111,11 @@ class Rejuvenator:
         pose = np.concatenate([past.pose, lineage.pose])
         landmark_id = np.concatenate([past.landmark_id, lineage.landmark_id])
         with jax.enable_x64(True):
-            given, place = least_squares.truncate(self._given, self._place, done)
-            name = self._identity[place] if self._known else landmark_id.ravel()[place]
-            found = refine.solve_and_reassociate(given, place, pose, name, self._known, again=True)
-        joint, lost, held = self._joint(found, given, place, young)
-        before = _held(past)
+            problem, flat_index = least_squares.truncate(self._problem, self._flat_index, done)
+            name = self._identity[flat_index] if self._known else landmark_id.ravel()[flat_index]
+            found = refine.solve_and_reassociate(problem, flat_index, pose, name, self._known, again=True)
+        joint, lost, held = self._joint(found, problem, flat_index, young)
+        before = _mapped_landmarks(past)
         event = [[done, MERGED, a, b] for a, b in found.merged]
         gone = before - held - {a for a, _ in found.merged}
         event += [[done, DROPPED, a, -1] for a in sorted(gone)]
@@ -129,16 +129,16 @@ class Rejuvenator:
             if done == max(self.due)
             else past.cov
         )
-        match = refine.landmark_ids(found, place, landmark_id.shape)
+        match = refine.landmark_ids(found, flat_index, landmark_id.shape)
         return SharedPast(path, cov, match, np.concatenate([past.event, event])), joint, lost
 
-    def _joint(self, found, given, place, young):
+    def _joint(self, found, problem, flat_index, young):
         """`redraw.Joint`, how many landmarks it has no slot for, and labels of those it holds."""
         fit, groups = found.fit, found.groups
-        rows, which = reassociation.in_field_of_view(groups)
+        rows, which = reassociation.index_mapped(groups)
         sure = (which >= 0) & (fit.weight > SURE)
         seen = np.bincount(which[sure], minlength=len(rows))
-        slots, lost = self._slots(groups.label[rows], seen, place)
+        slots, lost = self._slots(groups.landmark_id[rows], seen, flat_index)
         joint = posterior_sampling.empty_joint(self._config.landmarks)
         cov = posterior_sampling.covariance(fit)
         kept = np.flatnonzero(slots >= 0)
@@ -147,24 +147,24 @@ class Rejuvenator:
         joint.root[to, : len(index)] = posterior_sampling.factor_of(cov[np.ix_(index, index)])
         joint.pose[:] = fit.path[-1]
         own = np.linalg.cholesky(np.linalg.inv(fit.information))
-        sensor = least_squares.sensor_poses(fit.path[given.frame + 1], given.params)[:, :2]
-        p = given.params
-        odds = reassociation.existence(given, fit, reassociation.frames_seen(given, fit, which))
+        sensor = least_squares.sensor_poses(fit.path[problem.frame + 1], problem.params)[:, :2]
+        p = problem.params
+        odds = reassociation.existence(problem, fit, reassociation.frames_seen(problem, fit, which))
         for i in kept:
             s, mine = slots[i], sensor[sure & (which == i)]
             joint.kind[s], joint.mean[:, s] = posterior_sampling.POINT, fit.points[i]
             joint.factor[:, s] = own[i][[0, 1, 1], [0, 0, 1]]
-            joint.anchor[:, s] = _middle(mine, fit.points[i])
+            joint.anchor[:, s] = _median_viewpoint(mine, fit.points[i])
             joint.log_odds[s] = min(max(odds[i], 0), p.existence_max)
-            joint.count[s], joint.landmark_id[s] = seen[i], groups.label[rows[i]]
-        waiting = np.unique(groups.of[(groups.of >= 0) & (which < 0)])
+            joint.count[s], joint.landmark_id[s] = seen[i], groups.landmark_id[rows[i]]
+        waiting = np.unique(groups.assignment[(groups.assignment >= 0) & (which < 0)])
         # Only bearings leave a depth open.
-        waiting = waiting[: len(waiting) if given.sensor == "bearing" else 0]
-        lost += self._carry(joint, young, groups.label[waiting])
-        held = set(groups.label[rows[kept]].tolist())
+        waiting = waiting[: len(waiting) if problem.sensor == "bearing" else 0]
+        lost += self._carry(joint, young, groups.landmark_id[waiting])
+        held = set(groups.landmark_id[rows[kept]].tolist())
         return joint._replace(used=np.int32(len(index))), lost, held
 
-    def _slots(self, label, seen, place):
+    def _slots(self, label, seen, flat_index):
         """A slot for every point (-1: never measured, or none left; those measured most come
         first), and how many find none."""
         slots, there = np.full(len(label), -1), np.flatnonzero(seen)
@@ -190,7 +190,7 @@ class Rejuvenator:
         lost, from_ = len(from_) - len(to), from_[: len(to)]
         x, y, heading = young.pose.astype(float)
         held = young.landmarks
-        joint.kind[to] = posterior_sampling.YOUNG
+        joint.kind[to] = posterior_sampling.UNKNOWN_DEPTH
         joint.mean[:, to], joint.factor[:, to] = held.mean[:, from_], held.factor[:, from_]
         for name in ("count", "landmark_id", "log_odds"):
             if getattr(held, name) is not None:
@@ -203,32 +203,32 @@ class Rejuvenator:
         return lost
 
 
-class _Lane(NamedTuple):
+class _Particle(NamedTuple):
     pose: jax.Array
     landmarks: tuple
 
 
-def _young(state, best, config):
+def _take_particle(state, best, config):
     """Pose [3] and landmarks [..., M] of one particle, on every process."""
-    return _lane(state.pose, state.landmarks, jnp.int32(best), config)
+    return _index_particle(state.pose, state.landmarks, jnp.int32(best), config)
 
 
 @partial(jax.jit, static_argnames="config")
-def _lane(pose, world, best, config):
-    found = _Lane(pose[:, best], jax.tree.map(lambda leaf: leaf[..., best], world))
+def _index_particle(pose, world, best, config):
+    found = _Particle(pose[:, best], jax.tree.map(lambda leaf: leaf[..., best], world))
     if config.devices == 1:
         return found
     everywhere = sharding.shardings(sharding.replicated(found), config)
     return jax.lax.with_sharding_constraint(found, everywhere)
 
 
-def _middle(sensor, point):
+def _median_viewpoint(sensor, point):
     """Of the places [n, 2] a point was seen from, the one at the median distance."""
     distance = np.hypot(*(sensor - point).T)
     return sensor[np.argsort(distance, kind="stable")[len(distance) // 2]]
 
 
-def _held(past):
+def _mapped_landmarks(past):
     """Labels of the landmarks in the map when it was last refined."""
     held = set()
     for _, kind, label, _ in past.event.tolist():
