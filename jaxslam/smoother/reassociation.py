@@ -11,7 +11,9 @@ import numpy as np
 from jaxslam.models import sensors
 from jaxslam.smoother import least_squares
 
-MOST_DISTANCE = 9.2  # squared Mahalanobis distance of one place from itself, at most (0.99, chi2 of 2)
+MOST_DISTANCE = (
+    9.2  # squared Mahalanobis distance of one place from itself, at most (0.99, chi2 of 2)
+)
 STAY = 1.0  # nats by which another landmark must be the better one: near ties would alternate
 NEAR = 0.5  # m between two halves of one landmark, at most
 MOST_TOGETHER = 0.02  # of the frames of the rarer half of one landmark, how many may show both
@@ -73,13 +75,19 @@ def check_groups(problem, fit, groups, known, confirmed=True):
                 problem.params.existence_confirm if confirmed else 0
             )
             which = np.where(groups.assignment == -1, -1, which)
-            which = _choose_landmarks(problem, fit, which, keep, free=(which >= 0) | (groups.assignment == -1))
+            which = _choose_landmarks(
+                problem, fit, which, keep, free=(which >= 0) | (groups.assignment == -1)
+            )
     if problem.sensor == "bearing":
         keep &= has_depth(problem, fit, which) | bool(merged)
     waiting = (groups.assignment >= 0) & (index_mapped(groups)[1] < 0)
     point = groups.point.copy()
     point[rows[~keep]] = np.nan
-    of = np.where(waiting, groups.assignment, np.append(rows, -1)[which]) if not known else groups.assignment
+    of = (
+        np.where(waiting, groups.assignment, np.append(rows, -1)[which])
+        if not known
+        else groups.assignment
+    )
     return Groups(of, groups.landmark_id, point), merged
 
 

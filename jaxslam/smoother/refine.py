@@ -80,7 +80,9 @@ def refine(
     identity = np.asarray(frames.measurements.identity).ravel()
     with jax.enable_x64(True):
         params = params if known else allow_mistakes(params)
-        problem, flat_index = least_squares.make_problem(frames, start_pose, start_cov, params, sensor)
+        problem, flat_index = least_squares.make_problem(
+            frames, start_pose, start_cov, params, sensor
+        )
         name = identity[flat_index] if known else np.asarray(landmark_id).ravel()[flat_index]
         found = solve_and_reassociate(problem, flat_index, pose, name, known, progress=progress)
     return _to_refined(found, problem, flat_index, shape, identity if known else None)
@@ -114,9 +116,14 @@ def _drop_single_measurements(groups):
     """`Groups` without those of one measurement, which tell nothing of the path: where much is
     clutter, or the map was full, they are far more than the rest, and matrices of all of them would
     not fit."""
-    again = np.bincount(groups.assignment[groups.assignment >= 0], minlength=len(groups.landmark_id)) > 1
+    again = (
+        np.bincount(groups.assignment[groups.assignment >= 0], minlength=len(groups.landmark_id))
+        > 1
+    )
     number = np.append(np.where(again, np.cumsum(again) - 1, -1), -1)
-    return reassociation.Groups(number[groups.assignment], groups.landmark_id[again], groups.point[again])
+    return reassociation.Groups(
+        number[groups.assignment], groups.landmark_id[again], groups.point[again]
+    )
 
 
 def solve_and_reassociate(problem, flat_index, pose, name, known, again=False, progress=None):

@@ -113,7 +113,9 @@ class Rejuvenator:
         with jax.enable_x64(True):
             problem, flat_index = least_squares.truncate(self._problem, self._flat_index, done)
             name = self._identity[flat_index] if self._known else landmark_id.ravel()[flat_index]
-            found = refine.solve_and_reassociate(problem, flat_index, pose, name, self._known, again=True)
+            found = refine.solve_and_reassociate(
+                problem, flat_index, pose, name, self._known, again=True
+            )
         joint, lost, held = self._joint(found, problem, flat_index, young)
         before = _mapped_landmarks(past)
         event = [[done, MERGED, a, b] for a, b in found.merged]
