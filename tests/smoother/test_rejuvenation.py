@@ -58,7 +58,9 @@ def test_pose_and_points_are_those_of_the_whole_inverse(solved):
     size, poses = len(rows), 3 * len(fit.path)
     with jax.enable_x64(True):
         linear = least_squares._linearise(problem, fit.path, fit.points, which)
-        normal = least_squares._assemble(problem, linear, fit.weight * problem.tempering, which, size, 0.0)
+        normal = least_squares._assemble(
+            problem, linear, fit.weight * problem.tempering, which, size, 0.0
+        )
     whole = np.zeros((poses + 2 * size,) * 2)
     for t, block in enumerate(normal.diagonal):
         whole[3 * t : 3 * t + 3, 3 * t : 3 * t + 3] = block
