@@ -3,7 +3,7 @@
 Read in this order:
 - `genealogy`: the tree of particles and their ancestors; the smoothed path that it holds.
 - `refine`: least squares over one lineage, alternating with reassociation; start here for the map.
-- `least_squares`, `residuals`, `normal_equations`: the robust optimiser, its model, its linear algebra.
+- `least_squares`, `residuals`, `normal_equations`: the robust solver, its model, linear algebra.
 - `reassociation`: merge, drop and triangulate landmarks, and choose associations again.
 - `rejuvenation`, `posterior_sampling`: redraw the filter's particles from the refined posterior.
 - `events`: what rejuvenation did to the map.

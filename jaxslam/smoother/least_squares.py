@@ -52,7 +52,7 @@ class Problem(NamedTuple):
 class Fit(NamedTuple):
     """`path` [T + 1, 3] from the start pose; `points` [L, 2]; `factor` of the normal matrix;
     `weight` [M]: inlier probabilities (0: without a point); `information` [L, 2, 2] of the points
-    given the path; `residual`: root mean square of the inliers' whitened residuals; `cost` (nats)."""
+    given the path; `residual`: root mean square of inliers' whitened residuals; `cost` (nats)."""
 
     path: np.ndarray
     points: np.ndarray
@@ -199,7 +199,7 @@ def _descend(problem, path, points, which, width, progress):
 
 
 def _step(normal, path, points):
-    """The path and the points after a step, and its squared length; NaN if there is no solution."""
+    """Path and points after a step, and its squared length; NaN if there is no solution."""
     try:
         turn, shift, _ = normal_equations.solve(normal)
     except np.linalg.LinAlgError:
@@ -243,7 +243,7 @@ def _start_residual(problem, path):
 
 
 def _log_density(problem, rest, scale, width=1.0):
-    """log of (1 - outlier) x normal density [M] of whitened residuals [M, m], widened by `width`."""
+    """log of (1 - outlier) x normal density [M] of whitened residuals [M, m], at this width."""
     m = rest.shape[1]
     normaliser = np.sum(np.log(scale[:, :m]), 1) - m * (np.log(width) + sensors.LOG_2PI / 2)
     square = np.sum(rest**2, 1) / width**2

@@ -42,10 +42,9 @@ def test_what_was_filtered_outlives_a_refinement_that_fails(log, call, monkeypat
 def test_where_they_are_too_many_landmarks_seen_once_are_left_out(log, monkeypatch):
     config = run.config_for(log, "range_bearing", particles=30, landmarks=30)
     whole = run.run(log, config)
-    of, label = np.array([0, 2, -1, 2, 1, 0]), np.array([7, 8, 9])
-    fewer = refine._drop_single_measurements(
-        reassociation.Groups(of, label, np.arange(6.0).reshape(3, 2))
-    )
+    assignment, ids = np.array([0, 2, -1, 2, 1, 0]), np.array([7, 8, 9])
+    groups = reassociation.Groups(assignment, ids, np.arange(6.0).reshape(3, 2))
+    fewer = refine._drop_single_measurements(groups)
     np.testing.assert_array_equal(fewer.assignment, [0, 1, -1, 1, -1, 0])
     np.testing.assert_array_equal(fewer.landmark_id, [7, 9])
     np.testing.assert_array_equal(fewer.point, [[0, 1], [4, 5]])
