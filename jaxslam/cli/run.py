@@ -308,9 +308,8 @@ def _run_as_member(options, address, group):
         cluster.connect(address)
         if group.is_leader:
             return run_alone(options)
-        follow = (
-            FollowerCheckpoints(options.out, group.wait_for_leader) if options.checkpoints else None
-        )
+        wait = group.wait_for_leader
+        follow = FollowerCheckpoints(options.out, wait) if options.checkpoints else None
         with cluster.silence_stdout():
             run.run(
                 options.log,
@@ -320,13 +319,11 @@ def _run_as_member(options, address, group):
                 refine=False,
                 checkpoints=follow,
             )
-        group.wait_for_leader()
+        wait()
     except RuntimeError as error:
         if not common.is_lost_connection(error):
             raise
-        time.sleep(
-            cluster.EXIT_TIMEOUT
-        )  # meanwhile `group` learns which process died, and reports it
+        time.sleep(cluster.EXIT_TIMEOUT)  # `group` learns which process died, and reports it
         raise ConnectionError("the connection to another process broke") from None
 
 

@@ -213,7 +213,7 @@ class Checkpoints:
         path = _path(self._place, at.done)
         about = {"run": self._run, "versions": run_folder.versions(), "done": at.done}
         about |= {"seconds": at.seconds, "genealogy": at.tree is not None}
-        about |= {"past": at.past is not None}
+        about |= {"past": at.shared_past is not None}
         checkpoint_file.write_checkpoint(path, about, _columns(at))
         self._kept.append(path)
         self._prune()
@@ -363,8 +363,8 @@ def _columns(at):
     yield "entropy", at.entropy
     for name in at.summaries[0]._fields:
         yield f"summary.{name}", [getattr(part, name) for part in at.summaries]
-    if at.past is not None:
-        for name, column in at.past._asdict().items():
+    if at.shared_past is not None:
+        for name, column in at.shared_past._asdict().items():
             yield f"past.{name}", [column]
     if at.tree is not None:
         yield "tree.nodes", [np.array([len(level) for level in at.tree.pose])]
