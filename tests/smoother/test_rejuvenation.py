@@ -9,7 +9,7 @@ from test_refine import births, room
 
 from jaxslam import run
 from jaxslam.config import Config
-from jaxslam.filter import step
+from jaxslam.filter import map_estimate, step
 from jaxslam.logs.odometry import Odometry
 from jaxslam.results.events import list_events
 from jaxslam.results.metrics import compute_errors
@@ -122,7 +122,7 @@ def test_drawn_particles_have_the_moments_asked_for(sensor):
         if sensor == "bearing":
             ray = np.stack([np.cos(mean[0]), np.sin(mean[0])]) / mean[1]
             mean = world.anchor[:, slot] + ray
-            _, cov, known = step.landmarks.to_world("bearing", world)
+            _, cov, known = map_estimate.to_world("bearing", world)
             l11, l21, l22 = joint.factor[:, slot]
             exact = l11**2, l11 * l21, l21**2 + l22**2
             assert known[slot].all()
