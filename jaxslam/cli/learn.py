@@ -64,7 +64,8 @@ def learn(
     resume: option(bool, "Continue a fit of the same command that was stopped.") = False,
     seed: at_least("Seed of the random numbers.", 0, 2**32 - 1) = 0,
     start: _in(PARTS, option(float, "Use the logs from this time on [s after their start].")) = 0.0,
-    end: _in(PARTS, option(float, "Use the logs up to this time [s] (default: all).")) | None = None,
+    end: _in(PARTS, option(float, "Use the logs up to this time [s] (default: all).")) | None
+    = None,
     held_out_start: _in(PARTS, option(float, "The same for the held-out logs [s].")) = 0.0,
     held_out_end: _in(PARTS, option(float, "The same for the held-out logs [s].")) | None = None,
     window: _in(

@@ -9,7 +9,7 @@ from test_refine import births, room
 
 from jaxslam import run
 from jaxslam.config import Config
-from jaxslam.filter import map_estimate, step
+from jaxslam.filter import map_estimate
 from jaxslam.logs.odometry import Odometry
 from jaxslam.results.events import list_events
 from jaxslam.results.metrics import compute_errors
