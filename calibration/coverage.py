@@ -112,7 +112,7 @@ def list_warnings(corners, names, cover, uncertain):
         equal = (view.shape == v.shape and np.abs(view - v).max() < 0.01 for v in views[:i])
         duplicates += [(j, i) for j, same in enumerate(equal) if same][:1]
     if duplicates:
-        more = f" ({len(duplicates) - 1} more duplicates)" if len(duplicates) > 1 else ""
+        more = f" ({len(duplicates) - 1} more like this)" if len(duplicates) > 1 else ""
         j, i = duplicates[0]
         found.append(f"{names[j]} and {names[i]} are the same picture, which counts twice{more}")
     return found

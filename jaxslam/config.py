@@ -115,6 +115,11 @@ class Config:
             rule = f"is for association sampled, not {self.association}"
             raise ValueError(f"Config.uniform_association_prior: {rule}")
 
+    @property
+    def even(self) -> bool:
+        """`uniform_association_prior` by its name of version 0.1."""
+        return self.uniform_association_prior
+
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Config":
         """Make a `Config` of a dict as stored in files; names of version 0.1 are read, too."""

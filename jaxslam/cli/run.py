@@ -200,7 +200,7 @@ def run_filter(options, checkpoints=None):
 
     with (
         progress_bar("filtering", compiles=True) as progress,
-        cluster.silence_stderr() if options.shared else nullcontext(),
+        cluster.silence_stdout() if options.shared else nullcontext(),
     ):
         result = run.run(
             options.log,
@@ -290,26 +290,27 @@ def run_shared(options, address):
         "refined": not options.no_smoothing,
         "versions": run_folder.versions(),
     }
-    team = cluster.Team(address, cluster.rendezvous(address, run))
+    group = cluster.ProcessGroup(address, cluster.rendezvous(address, run))
     code = FAULT
     try:
-        code = common.run_command(lambda: _run_as_member(options, address, team))
+        code = common.run_command(lambda: _run_as_member(options, address, group))
     except Exception:
         traceback.print_exc()
     finally:
-        team.leave(code)
+        group.exit(code)
 
 
-def _run_as_member(options, address, team):
+def _run_as_member(options, address, group):
     from jaxslam.runs import run
     from jaxslam.runs.checkpoints import FollowerCheckpoints
 
     try:
         cluster.connect(address)
-        if team.leads:
+        if group.is_leader:
             return run_alone(options)
-        follow = FollowerCheckpoints(options.out, team.wait) if options.checkpoints else None
-        with cluster.silence_stderr():
+        wait = group.wait_for_leader
+        follow = FollowerCheckpoints(options.out, wait) if options.checkpoints else None
+        with cluster.silence_stdout():
             run.run(
                 options.log,
                 options.config,
@@ -318,11 +319,11 @@ def _run_as_member(options, address, team):
                 refine=False,
                 checkpoints=follow,
             )
-        team.wait()
+        wait()
     except RuntimeError as error:
         if not common.is_lost_connection(error):
             raise
-        time.sleep(cluster.GRACE)  # meanwhile `team` learns which process died, and reports it
+        time.sleep(cluster.EXIT_TIMEOUT)  # `group` learns which process died, and reports it
         raise ConnectionError("the connection to another process broke") from None
 
 
@@ -355,7 +356,7 @@ def run_batch(options, seeds, sweep, devices):
         )
     with progress_bar("writing"):
         batch.save(tasks, results, options.out, options.overwrite, options.source)
-    print(batch.table(batch.summary_rows(tasks, results)))
+    print(batch.format_runs(batch.summary_rows(tasks, results)))
     print(f"{options.out}: the table is {options.out / batch.TABLE}, with a folder for each run")
     for line in dict.fromkeys(line for result in results for line in result.flags):
         warn(line)

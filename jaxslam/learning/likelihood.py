@@ -1,15 +1,15 @@
 """The log likelihood of a log under the filter's model, and its derivatives by `Params`.
 
-The filter's evidence estimates the marginal likelihood Z of the measurements. It is a step function
-of the parameters wherever particles are resampled or associations drawn, and differentiating what
-the program computed ("plain") leaves these out: biased, and no better with more particles. Fisher's
-identity asks for something else: the posterior mean of the derivative of log p(path, associations,
-measurements), with path and associations held still ("frozen"). Every particle carries that
-derivative s as it moves, is weighed and resampled; only sensor parameters need derivatives through
-the landmark EKFs. Forward mode: the memory does not grow with the log.
+The filter's evidence estimates the marginal likelihood Z of the measurements. It jumps as a function
+of the parameters wherever particles are resampled or associations drawn; automatic differentiation
+of the filter ignores these jumps and is biased, whatever the number of particles. The score is
+computed by Fisher's identity instead: the posterior mean of the derivative of log p(path,
+associations, measurements), with path and associations fixed ("frozen"). Every particle carries that
+derivative s as it moves, is weighted and resampled; only sensor parameters need derivatives through
+the landmark EKFs. Forward mode: memory does not grow with the log.
 
-The inherited part forgets with a `discount` per step: s tells of ever fewer distinct ancestors, and
-what it adds to the step at hand is mostly noise (Poyiadjis, Doucet and Singh 2011; the discount is
+The inherited s fades by a `discount` per step: it describes ever fewer distinct ancestors, and its
+contribution to the current step is mostly noise (Poyiadjis, Doucet and Singh 2011; the discount is
 that of MOP, Tan, Hooker and Ionides 2024). docs/gradients.md says when to distrust which.
 """
 
@@ -42,8 +42,8 @@ BIASED = (
 
 
 class Data(NamedTuple):
-    """What the likelihood is of: `start_pose` [3], `start_cov` [3, 3], T frames' arrays, and a map
-    to start with (None: empty), as `filter.init` takes it."""
+    """A log as arrays: `start_pose` [3], `start_cov` [3, 3], T frames' odometry and measurements,
+    and an initial map as for `step.init` (None: empty)."""
 
     start_pose: jax.Array
     start_cov: jax.Array
@@ -74,24 +74,24 @@ def learnable(config):
 
 
 def data_from_log(log, config, params=None, steps=None):
-    """`Data` of a `Log`; `steps`: filled up with so many frames of nothing (None: not).
+    """Make `Data` of a `Log`; `steps`: padded to this number of frames (None: not padded).
 
-    Places are shifted so that the start is near the origin; float32 has 7 digits. Raises
-    `ValueError` when the log can't supply what the configuration asks or has more steps.
+    Positions are relative to the start, as float32 has 7 digits. Raises `ValueError` when the log
+    lacks what the configuration needs, or has more frames than `steps`.
     """
-    made = frames_from_log(log, dataclasses.replace(config, descriptors=0), params)
-    total = len(made.time)
+    frames = frames_from_log(log, dataclasses.replace(config, descriptors=0), params)
+    total = len(frames.time)
     steps = total if steps is None else steps
     if steps < total:
         raise ValueError(f"{log.name}: has {total} frames, more than the {steps} asked for")
     real = jnp.zeros(()).dtype
 
-    def fill(leaf):
+    def pad(leaf):
         leaf = np.pad(leaf, [(0, steps - total), *[(0, 0)] * (leaf.ndim - 1)])
         return jnp.asarray(leaf.astype(real) if leaf.dtype.kind == "f" else leaf)
 
     start = jnp.asarray([0.0, 0.0, log.start_pose[2]], real)
-    arrays = jax.tree.map(fill, (made.odometry, made.measurements))
+    arrays = jax.tree.map(pad, (frames.odometry, frames.measurements))
     return Data(start, jnp.asarray(log.start_cov, real), *arrays)
 
 
@@ -102,12 +102,11 @@ def log_likelihood(
     config: Config,
     discount: float | jax.Array = DISCOUNT,
 ) -> jax.Array:
-    """Estimate of the log likelihood of a `Log` or `Data`, with a derivative by `params`.
+    """Estimate the log likelihood of a `Log` or `Data`; differentiable by `params`.
 
-    `jax.grad` gives the Fisher score (`score`), for `Params` or any values put into them. It is no
-    derivative of the value returned: that one jumps. Derivatives by what `learnable` does not name
-    are zero. The value includes, besides the filter's evidence, the probability of as few new
-    landmarks as there were (`frame_terms`).
+    `jax.grad` gives the Fisher score (`score`), not the derivative of the value returned, which
+    jumps. Derivatives by parameters that are not `learnable` are zero. Besides the filter's
+    evidence the value includes the probability of the number of new landmarks (`frame_terms`).
     """
     check(config)
     data = log if isinstance(log, Data) else data_from_log(log, config)
@@ -124,7 +123,7 @@ def score(
     names: Sequence[str],
     discount: float = DISCOUNT,
 ) -> Score:
-    """`Score` of a `Log` or `Data` by the parameters `names`, of which `learnable` has the list.
+    """Compute the `Score` of a `Log` or `Data` by the parameters `names` (`learnable` lists them).
 
     With `discount` 1 its expectation, weighted with the likelihood estimates, is exactly the
     likelihood's derivative. Raises `ValueError` for names that have no derivative.
@@ -142,7 +141,7 @@ def check(config, names=()):
     for name in names:
         if name not in allowed:
             raise ValueError(
-                f"{name!r} can't be learnt with sensor {config.sensor}; these can: "
+                f"{name!r} can't be learned with sensor {config.sensor}; these can: "
                 f"{', '.join(allowed)}"
             )
     if config.association == "maximum_likelihood":
@@ -186,26 +185,26 @@ def value(params, data, key, config):
 
 
 def _initial_state(data, key, config):
-    """`filter.State` before the first frame."""
+    """`State` before the first frame."""
     return fastslam.init(config, key, data.start_pose, data.start_cov, data.landmarks_given)
 
 
 def draw_for_frame(key, step, config):
-    """`filter.draws`, and for `known` associations uniforms to draw between slot and clutter."""
+    """Draw the random numbers of a step; with `known` association also uniforms for clutter."""
     chance = fastslam.draw_random_numbers(key, step, config)
     if config.association == "known" and config.clutter:
         shape = config.measurements, config.particles
-        own = jax.random.fold_in(key, 2**30 + step)  # no step's key, nor any of its parts
+        own = jax.random.fold_in(key, 2**30 + step)  # different from every step's keys
         chance = chance._replace(picks=jax.random.uniform(own, shape, float))
     return chance
 
 
 def frame_terms(measurements, params):
-    """What a frame adds to the log likelihood for every particle alike.
+    """Terms of a frame's log likelihood that are equal for all particles.
 
-    New landmarks are a Poisson process of `density_new` per m^2 of the view, so having seen no more
-    than there are costs density times area (without it the likelihood would only ever grow with the
-    density). Positions that rest on odometry were multiplied by its gain: the change of area.
+    New landmarks are a Poisson process of `density_new` per m^2 of the view, whose normalization is
+    density times area (without it the likelihood would increase with the density for ever).
+    Positions derived from odometry were multiplied by its gain: the Jacobian of that scaling.
     """
     area = (params.view_max - params.view_min) * params.view_range**2 / 2
     term = jnp.where(measurements.active, -params.density_new * area, 0.0)
@@ -216,8 +215,8 @@ def frame_terms(measurements, params):
 
 
 class _Carry(NamedTuple):
-    """State; derivatives by the parameters (first axis) of every particle's landmarks and of its
-    log weight, as inherited; sums of the steps' scores and of what all particles share of them;
+    """State; derivatives by the parameters (first axis) of every particle's landmarks, and of its
+    log weight as inherited; sums of the steps' scores and of their part common to all particles;
     least effective sample size."""
 
     state: fastslam.State
@@ -230,8 +229,8 @@ class _Carry(NamedTuple):
 
 @partial(jax.jit, static_argnames=("config", "names"))
 def score_and_value(params, data, key, config, names, discount=DISCOUNT):
-    """`score` of `Data`, unchecked, for use inside other compiled programs."""
-    # Derivatives are resampled along with the landmarks; where these lie makes no difference.
+    """`score` of `Data` without checks, for use inside compiled functions."""
+    # Derivatives are resampled along with the landmarks, which is not done lazily.
     config = dataclasses.replace(config, lazy=False)
     start, key = jax.random.split(key)
     state = _initial_state(data, start, config)
@@ -250,8 +249,8 @@ def score_and_value(params, data, key, config, names, discount=DISCOUNT):
     def step(carry, frame):
         return _step(carry, frame, params, key, config, names, through, discount)
 
-    looks = data.odometry, data.measurements
-    last, (steps, log_evidence) = jax.lax.scan(step, carry, looks)
+    frames = data.odometry, data.measurements
+    last, (steps, log_evidence) = jax.lax.scan(step, carry, frames)
     weight = jnp.exp(last.state.log_weight)
     at_end = last.inherited @ weight + last.shared
     total = jnp.where(discount == 1, at_end, last.total)
@@ -259,7 +258,7 @@ def score_and_value(params, data, key, config, names, discount=DISCOUNT):
 
 
 def _filter_through(names, config, measurements):
-    """Those of the names whose derivatives go through landmarks."""
+    """The names whose derivatives pass through the landmarks."""
     sensor = learned_by(config.sensor)
     if measurements.scale is not None:
         sensor = (*sensor, "gain_tran")
@@ -267,7 +266,7 @@ def _filter_through(names, config, measurements):
 
 
 def _parts(through, config):
-    """Arrays of the map that have derivatives: an anchor moves with the mounting only."""
+    """Arrays of the map that have derivatives: anchors depend on the mounting only."""
     if not through:
         return ()
     anchored = config.sensor == "bearing" and {"mount_x", "mount_y"} & {*through}
@@ -275,20 +274,20 @@ def _parts(through, config):
 
 
 def _step(carry, frame, params, key, config, names, through, discount):
-    """A filter step that takes the derivatives along."""
+    """A filter step that propagates the derivatives."""
     state, (odometry, measurements) = carry.state, frame
     chance = draw_for_frame(key, state.step, config)
-    seen, world_dot, by_density = _look(carry, chance, frame, params, config, through)
+    seen, world_dot, by_density = _observe(carry, chance, frame, params, config, through)
     gained = dict(zip(through, by_density, strict=True))
     drawn = motion_score(seen.u, odometry, params, [n for n in names if n in learned_by(MOTION)])
-    told = alternatives_score(seen.match, params)
-    for name, more in {**drawn, **{n: told[n] for n in names if n in told}}.items():
+    chosen = alternatives_score(seen.match, params)
+    for name, more in {**drawn, **{n: chosen[n] for n in names if n in chosen}}.items():
         gained[name] = gained[name] + more if name in gained else more
     after, info = fastslam.weigh_and_resample(chance, state, seen, measurements, config)
     before, weight = jnp.exp(state.log_weight), jnp.exp(info.log_weight)
     inherited = discount * carry.inherited
     own = inherited + jnp.stack([gained[name] for name in names]) if names else inherited
-    # What has no weight has no say, not even as 0 times NaN.
+    # A particle without weight must not contribute, not even 0 times NaN.
     own = jnp.where(weight > 0, own, 0.0)
     extra = _frame_score(measurements, params, names)
     gradient = own @ weight - inherited @ before + extra
@@ -298,12 +297,12 @@ def _step(carry, frame, params, key, config, names, through, discount):
     return _Carry(after, world_dot, own, *sums), (gradient, log_evidence)
 
 
-def _look(carry, chance, frame, params, config, through):
-    """`Observed` of the particles, and its derivatives: map, density, by `through`."""
+def _observe(carry, chance, frame, params, config, through):
+    """`Observed` of the particles, and derivatives of map and density by `through`."""
     state = carry.state
     parts = tuple(carry.world)
 
-    def look(values, arrays):
+    def observe(values, arrays):
         given = params._replace(**dict(zip(through, values, strict=True)))
         moved = state._replace(landmarks=state.landmarks._replace(**arrays))
         seen = blocks.observe(moved, chance, *frame, given, config, frozen=True)
@@ -312,11 +311,11 @@ def _look(carry, chance, frame, params, config, through):
     values = tuple(getattr(params, name) for name in through)
     arrays = {name: getattr(state.landmarks, name) for name in parts}
     if not through:
-        return look(values, arrays)[1], {}, ()
+        return observe(values, arrays)[1], {}, ()
 
     def push(direction, world_dot):
         tangents = tuple(direction), world_dot
-        return jax.jvp(look, (values, arrays), tangents, has_aux=True)
+        return jax.jvp(observe, (values, arrays), tangents, has_aux=True)
 
     basis = jnp.eye(len(through), dtype=state.pose.dtype)
     _, (world_dot, by_density), seen = jax.vmap(push, in_axes=0, out_axes=(None, 0, None))(
@@ -326,7 +325,7 @@ def _look(carry, chance, frame, params, config, through):
 
 
 def motion_score(u, odometry, params, names):
-    """Derivatives [n] by name of the log density of the poses drawn, these held still."""
+    """Derivatives [N] by name of the log density of the poses drawn, with these fixed."""
 
     def density(values):
         return motion.log_density_of(u, odometry, params._replace(**values), params)
@@ -335,7 +334,7 @@ def motion_score(u, odometry, params, names):
 
 
 def alternatives_score(match, params):
-    """Derivatives [n] of the log probabilities of clutter and of new landmarks drawn, by name."""
+    """Derivatives [N] by name of the log probability of the clutter and new landmarks drawn."""
     new = (match == NEW).sum(0)
     clutter = (match == CLUTTER).sum(0)
     real = new + (match >= 0).sum(0)
