@@ -84,14 +84,14 @@ def learn(
 ):  # fmt: skip
     """Learn noise and systematic errors from logs by maximum likelihood.
 
-    Prints start, estimate, standard error and verdict of every parameter. Writes the
-    file --out for jaxslam run --params, and beside it learn.csv and learn.png with
-    every step. Held-out logs decide when to stop and show what was gained; without
-    them, noise particular to one log may be learned. They may be other parts of the
-    same log:
+    Prints start, estimate, standard error and verdict of every parameter. Writes
+    the file --out for jaxslam run --params, and beside it learn.csv and learn.png
+    with every step. Held-out logs decide when to stop and show what was gained;
+    without them, noise particular to one log may be learned. They may be other
+    parts of the same log:
 
     Example: jaxslam learn lost-in-the-woods --end 600 --held-out lost-in-the-woods
-    --held-out-start 600 --parameters err_rot,err_drift,gain_rot --out fit/params.toml
+    --held-out-start 600 --parameters err_rot,gain_rot --out fit/params.toml
     """
     files = _files(out, overwrite, resume)
     if not logs:
