@@ -137,17 +137,15 @@ def _check_process(connection, address, run, connections):
     connection.settimeout(REPLY_TIMEOUT)
     try:
         message = json.loads(_receive(connection))
-        process, processes, other = message["process"], message["processes"], message["run"]
+        process, count, other = message["process"], message["processes"], message["run"]
     except (OSError, ValueError, KeyError, TypeError):  # another program
         connection.close()
         return None
     problem = None
     if process in (0, *connections):
         problem = f"two processes have --process-id {process}"
-    elif processes != address.processes:
-        problem = (
-            f"process {process} has --num-processes {processes}, process 0 {address.processes}"
-        )
+    elif count != address.processes:
+        problem = f"process {process} has --num-processes {count}, process 0 {address.processes}"
     elif differing := find_differences(run, other):
         problem = f"process {process} has other settings than process 0: {differing}"
     if problem:
