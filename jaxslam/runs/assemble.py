@@ -10,6 +10,7 @@ import numpy as np
 from jaxslam.filter import map_estimate, sharding
 from jaxslam.filter import step as fastslam
 from jaxslam.logs.odometry import dead_reckoning
+from jaxslam.results.events import association_entropy
 from jaxslam.results.result import MapEstimate, Result
 from jaxslam.smoother.genealogy import Ancestral, Lineage, Tree, smooth_ancestral, trace_lineage
 from jaxslam.smoother.rejuvenation import SharedPast
@@ -69,6 +70,13 @@ class RunProgress(NamedTuple):
     seconds: float
     shared_past: SharedPast | None
     entropy: list
+
+    def add_chunk(self, summary, history):
+        """Append a chunk's `Summary` and `ParticleHistory` to the lists and the genealogy."""
+        self.summaries.append(summary)
+        self.entropy.append(association_entropy(history.landmark_id, history.ancestors))
+        if self.tree is not None:
+            self.tree.extend(*history)
 
 
 def local_origin(log):
