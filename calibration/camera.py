@@ -141,20 +141,12 @@ def calibrate_corners(
     uncertain = bearing_uncertainty(camera, cover.radius)
     doubts = list_warnings(corners, names, cover, uncertain)
     _check_bearings(cover, uncertain, doubts)
+    order = order if model == "polynomial" else None
+    scores = {key: (fit.rms, scores.get(key, math.nan)) for key, fit in fits.items()}
     return Calibration(
-        camera=camera,
-        solution=solution,
-        corners=corners,
-        names=names,
-        rejected=rejected,
-        order=order if model == "polynomial" else None,
-        scores={key: (fit.rms, scores.get(key, math.nan)) for key, fit in fits.items()},
-        variant="given",
-        again=0,
-        coverage=cover,
-        bearings=uncertain,
-        warnings=doubts,
-    )
+        camera, solution, corners, names, rejected, order, scores, variant="given", again=0,
+        coverage=cover, bearings=uncertain, warnings=doubts,
+    )  # fmt: skip
 
 
 def cross_validate(corners, fits, model, order=None, simple=False, folds=2):

@@ -79,18 +79,13 @@ def find_tilt(images, camera, progress=None):
         previous, camera = camera, camera_with_up(camera, up)
     _check_change(nominal, camera)
     kept = weight > 0
-    residual = lines.normal[kept] @ up
-    return Tilt(
-        roll=camera.roll,
-        pitch=camera.pitch,
-        covariance=_covariance(lines, up, weight),
-        lines=int(kept.sum()),
-        candidates=len(weight),
-        images=len(normals),
-        scatter=float(1.4826 * np.median(np.abs(residual))),
-        per_image=_per_image(lines, weight, previous, names),
-        skipped=skipped,
+    counts = int(kept.sum()), len(weight), len(normals)
+    scatter = float(1.4826 * np.median(np.abs(lines.normal[kept] @ up)))
+    covariance, per_image = (
+        _covariance(lines, up, weight),
+        _per_image(lines, weight, previous, names),
     )
+    return Tilt(camera.roll, camera.pitch, covariance, *counts, scatter, per_image, skipped)
 
 
 def camera_with_tilt(camera, tilt):

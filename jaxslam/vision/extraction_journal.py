@@ -64,7 +64,7 @@ class ExtractionJournal:
             changed = sorted(k for k in both if settings.get(k) != self.settings.get(k))
             raise ValueError(
                 f"{self.path}: was started with other settings ({', '.join(changed)}); use those "
-                "again, or delete it to start afresh"
+                "again, or delete it to restart"
             )
         self.images = images
         return sum(map(len, lines))
