@@ -34,15 +34,10 @@ class Corners:
         return int(self.board[-1]) + 1
 
     def of_boards(self, keep):
-        """The corners of the boards `keep` (indices), renumbered from 0."""
-        part = [self.board == b for b in keep]
-        number = np.concatenate([np.full(p.sum(), i) for i, p in enumerate(part)])
-        return Corners(
-            np.concatenate([self.pixel[p] for p in part]),
-            np.concatenate([self.point[p] for p in part]),
-            number,
-            self.size,
-        )
+        """The corners of the boards `keep` (sorted indices), renumbered from 0."""
+        index = np.concatenate([np.flatnonzero(self.board == b) for b in keep])
+        number = np.searchsorted(keep, self.board[index])
+        return Corners(self.pixel[index], self.point[index], number, self.size)
 
 
 @dataclass(frozen=True)
@@ -168,12 +163,9 @@ class _Linearization:
         change = -np.linalg.lstsq(schur, right)[0]
         poses = -solved[..., -1] - solved[..., :-1] @ change
         old = self.solution
-        return replace(
-            old,
-            params=old.params + old.free @ change,
-            rotation=rotation(poses[:, :3]) @ old.rotation,
-            translation=old.translation + poses[:, 3:],
-        )
+        params, translation = old.params + old.free @ change, old.translation + poses[:, 3:]
+        turned = rotation(poses[:, :3]) @ old.rotation
+        return replace(old, params=params, rotation=turned, translation=translation)
 
     def information(self):
         """Information [F, F] per px^2 of the camera's free directions, with poses eliminated."""

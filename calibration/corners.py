@@ -79,18 +79,15 @@ def find_views(source, board, progress=None):
             rejected.append((name, no_board))
     good = [view for view in seen if view[2] == size and view[3] is not None]
     if not good:
-        raise ValueError(
-            f"{origin}: {no_board} in any of {len(seen)} images; count where four squares meet,"
-            " not the squares"
-        )
+        count = "count where four squares meet, not the squares"
+        raise ValueError(f"{origin}: {no_board} in any of {len(seen)} images; {count}")
     names, files, _, found = map(list, zip(*good, strict=True))
     return Views(names, files, {v: [f[v] for f in found] for v in VARIANTS}, size, rejected)
 
 
 def find_corners(grey, board):
     """Find the board in a grey image [H, W]: corners [n, 2] px by variant, or None."""
-    found = find_grid(grey, board, PLAIN)
-    accurate = find_grid(grey, board, ACCURATE)
+    found, accurate = (find_grid(grey, board, flags) for flags in (PLAIN, ACCURATE))
     found = accurate if found is None else found
     if found is None:
         return None

@@ -118,9 +118,8 @@ def draw(report, log, path):
         axes.plot(*true.T, "o", ms=8, mfc="none", mec=LANDMARK, label="surveyed line")
         axes.plot(*_sensor_poses(log)[:, :2].T, ".", ms=3, color=TRUE, label="image taken")
         axes.set(xlabel="x [m]", ylabel="y [m]", title="Points triangulated on a straight drive")
-        axes.set_aspect("equal")
-        low, high = np.min(true, axis=0) - 0.6, np.max(true, axis=0) + 0.6
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        x, y = np.stack([np.min(true, axis=0) - 0.6, np.max(true, axis=0) + 0.6], 1)
+        axes.set(xlim=x, ylim=y, aspect="equal")
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
         return write_figure(figure, path)
 

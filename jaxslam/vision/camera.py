@@ -27,8 +27,7 @@ NEWTON = 6  # steps; four reach double precision from the table's value
 
 def parameter_names(model, count=None):
     """Names of the first `count` parameters of a model (None: all); a polynomial may end early."""
-    names = {"polynomial": POLYNOMIAL, "unified": UNIFIED}[model]
-    return names[:count]
+    return {"polynomial": POLYNOMIAL, "unified": UNIFIED}[model][:count]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +74,7 @@ class Camera:
         _set(self, "elevation", _tuple("elevation", self.elevation, 2))
         low, high = self.elevation
         if not -math.pi / 2 <= low < high <= math.pi / 2:
-            raise ValueError(
-                f"camera: elevation {low:g}..{high:g} rad; must rise within -pi/2..pi/2"
-            )
+            raise ValueError(f"camera: elevation {low:g}..{high:g} rad; must rise within +-pi/2")
         if self.covariance is not None:
             _set(self, "covariance", _numbers("covariance", self.covariance, 2))
             if self.covariance.shape != (count, count):
@@ -102,8 +99,8 @@ class Camera:
     @property
     def matrix(self) -> np.ndarray:
         """Matrix [3, 3] from the model frame to the robot's frame (improper for a mirror)."""
-        back = -1.0 if self.mirror else 1.0
-        base = np.diag([1.0, 1.0, back]) if self.lens == "up" else np.diag([1.0, -1.0, -back])
+        side, back = 1.0 if self.lens == "up" else -1.0, -1.0 if self.mirror else 1.0
+        base = np.diag([1.0, side, side * back])
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
         return tilt_matrix(self.roll, self.pitch) @ turn @ base
@@ -129,8 +126,7 @@ class Camera:
 
     def _inside(self, pixel):
         with np.errstate(invalid="ignore"):
-            above = (pixel >= -0.5).all(-1)
-            return above & (pixel <= np.array(self.size) - 0.5).all(-1)
+            return ((pixel >= -0.5) & (pixel <= np.array(self.size) - 0.5)).all(-1)
 
 
 def tilt_matrix(roll, pitch):
@@ -190,8 +186,7 @@ def ray_to_pixel(model, params, size, ray):
         x, y, _ = _distort(x / lateral * rho, y / lateral * rho, (0.0, 0.0, p1, p2))
         x, y = half * x, half * y
         u, v = params[0] + x + e * y, params[1] + d * x + c * y
-    pixel = xp.stack([u, v], -1)
-    return xp.where(imaged[..., None], pixel, xp.nan)
+    return xp.where(imaged[..., None], xp.stack([u, v], -1), xp.nan)
 
 
 def _radius(xp, stop, a, lateral, z):

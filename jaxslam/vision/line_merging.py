@@ -44,10 +44,9 @@ def separate_close_pairs(lines, width):
     if len(lines.bearing) < 2:
         return lines
     apart = _bearing_difference(lines)
-    overlap = np.minimum(lines.high[:, None], lines.high) - np.maximum(
-        lines.low[:, None], lines.low
-    )
-    part = np.clip(overlap / (lines.high - lines.low)[:, None], 0, 1)
+    low, high = lines.low, lines.high
+    overlap = np.minimum(high[:, None], high) - np.maximum(low[:, None], low)
+    part = np.clip(overlap / (high - low)[:, None], 0, 1)
     pair = (part > 0.3) & (lines.polarity[:, None] != lines.polarity)
     square = lines.strength**2
     share = square / (square[:, None] + square)  # the weaker line is shifted more

@@ -124,14 +124,10 @@ def _intersect(bearing, motion):
 
 def _reasons(ranges, parallax, baseline, settings):
     """Index [m] of the first of `REASONS` that applies."""
-    far, near = ranges.max(axis=1), ranges.min(axis=1)
-    conditions = [
-        baseline < settings.least_baseline,
-        ~(parallax >= settings.parallax),
-        ~(near > 0),
-        ranges[:, 1] < settings.nearest,
-        far > settings.farthest,
-    ]
+    still, parallel = baseline < settings.least_baseline, ~(parallax >= settings.parallax)
+    behind, near = ~(ranges.min(axis=1) > 0), ranges[:, 1] < settings.nearest
+    far = ranges.max(axis=1) > settings.farthest
+    conditions = [still, parallel, behind, near, far]
     return np.select(conditions, [STILL, PARALLEL, BEHIND, NEAR, FAR], OK)
 
 
