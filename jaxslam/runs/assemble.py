@@ -37,13 +37,10 @@ class Summary(NamedTuple):
     survivor: jax.Array
 
 
-# Fields that `Summary` and `Result` take from `step.Info` as they are; there, `pose` and
-# `landmark_id` are those of all particles. A new diagnostic is a field of each of the three.
-COPIED = tuple(
-    name
-    for name in Summary._fields
-    if name in fastslam.Info._fields and name not in ("pose", "landmark_id")
-)
+OF_ALL = "pose", "landmark_id"  # fields of `step.Info` that are those of all particles
+# Fields that `Summary` and `Result` take from `step.Info` as they are: a new diagnostic is a field
+# of each of the three.
+COPIED = tuple(f for f in Summary._fields if f in fastslam.Info._fields and f not in OF_ALL)
 COUNTS = "overflow", "outliers", "forgotten"  # over all particles; in `Result` the mean
 
 

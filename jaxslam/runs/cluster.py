@@ -59,9 +59,7 @@ def find_address(coordinator=None, processes=None, process=None, env=os.environ)
     if not parts or not 0 < int(parts[2]) < 2**16:
         raise ValueError(f"--coordinator is {address!r}; must be HOST:PORT, like 127.0.0.1:4321")
     if not 0 <= process < processes:
-        raise ValueError(
-            f"--process-id is {process}; of {processes} it must be 0 to {processes - 1}"
-        )
+        raise ValueError(f"--process-id is {process}; must be 0 to {processes - 1}")
     if processes == 1:
         return None
     return ClusterAddress(parts[1].strip("[]"), int(parts[2]), processes, process)
@@ -220,9 +218,7 @@ def connect(address):
         )  # fmt: skip
     except RuntimeError as error:
         cause = str(error).splitlines()[0]
-        raise ConnectionError(
-            f"JAX can't connect the processes at {address.address}: {cause}"
-        ) from None
+        raise ConnectionError(f"JAX can't connect at {address.address}: {cause}") from None
 
 
 class ProcessGroup:

@@ -258,7 +258,7 @@ def test_options_that_do_not_fit_are_refused(at, short, refuse):
     run = "run", short
     three = *run, "--coordinator", "127.0.0.1:4321", "--num-processes", 2
     assert "--process-id missing; --coordinator, --num-processes, --process-id go" in refuse(*three)
-    assert "--process-id is 2; of 2 it must be 0 to 1" in refuse(*three, "--process-id", 2)
+    assert "--process-id is 2; must be 0 to 1" in refuse(*three, "--process-id", 2)
     line = "which 3 devices can't share evenly; take 999 or 1002"
     assert line in refuse(*run, "--devices", 3)
     assert "which 4 devices can't share evenly; take 4" in refuse(
