@@ -45,8 +45,7 @@ class Solution:
     """Camera params [P] and poses of the boards: rotations [B, 3, 3], translations [B, 3] m.
 
     `free` [P, F]: directions in which params were estimated. `residual` [n, 2] px of every corner;
-    `weight` [n]: 0 for outliers. `information` [F, F] per px^2 of the free directions, with poses
-    eliminated.
+    `weight` [n]: 0 for outliers. `information` [F, F] per px^2 along `free`, poses eliminated.
     """
 
     params: np.ndarray
@@ -147,10 +146,8 @@ class _Linearization:
         root = np.sqrt(self.solution.weight * huber)[:, None]
         r, c, p = root * self.residual, root[..., None] * self.camera, root[..., None] * self.pose
         flat = c.reshape(r.size, c.shape[-1])
-        cross, own, pull = (
-            np.add.reduceat(product, self.starts)
-            for product in (c.mT @ p, p.mT @ p, (p.mT @ r[..., None])[..., 0])
-        )
+        products = c.mT @ p, p.mT @ p, (p.mT @ r[..., None])[..., 0]
+        cross, own, pull = (np.add.reduceat(product, self.starts) for product in products)
         return flat.T @ flat, cross, own, flat.T @ r.ravel(), pull
 
     def step(self, damping):

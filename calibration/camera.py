@@ -118,8 +118,7 @@ def calibrate_corners(
     """Calibrate a camera from corners: `Calibration`.
 
     `pixels`: a list of [n, 2] px, one per board; `points`: [n, 2] m on the board, one array for all
-    or a list; boards may be partial. `size`: (width, height) px. Other arguments and errors as in
-    `calibrate_camera`.
+    or a list; boards may be partial. `size`: (width, height) px. Otherwise as `calibrate_camera`.
     """
     if model == "polynomial" and order not in (None, *ORDERS):
         raise ValueError(f"order {order!r} of the polynomial: must be 4, 5 or 6")
@@ -288,8 +287,7 @@ def _find_misfits(corners, solution):
 
 
 def _find_outliers_again(files, corners, solution, board):
-    """Localise outlier corners again, near where the camera predicts them: the pixels of every
-    board, and the number of corners replaced."""
+    """Localise outliers again near their predictions: pixels of every board, number replaced."""
     pixels, again = [], 0
     for b, file in enumerate(files):
         own = corners.board == b

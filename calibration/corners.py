@@ -1,7 +1,6 @@
 """Find the corners of a chessboard in images; unusable images are rejected with a reason.
 
-`board` is the number of inner corners (per row, per column), as in OpenCV. Pixels are (u, v), with
-the centre of the first at (0, 0).
+`board`: number of inner corners (per row, per column), as in OpenCV. Pixels as in `Camera`.
 """
 
 from collections import Counter
@@ -97,8 +96,7 @@ def find_corners(grey, board):
 
 
 def find_grid(grey, board, flags):
-    """Search for the board in the image, with more local contrast, and at twice the size, until it
-    is found: corners [n, 2] px, or None."""
+    """Find the board's corners [n, 2] px in the first of `_attempts` that shows it, or None."""
     for image, scale in _attempts(grey):
         good, corners = cv2.findChessboardCornersSB(image, tuple(board), flags=flags)
         if good:
@@ -108,6 +106,7 @@ def find_grid(grey, board, flags):
 
 
 def _attempts(grey):
+    """Yield (image, scale): as it is, with more local contrast, and at twice the size."""
     yield grey, 1
     yield cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey), 1
     if 4 * grey.size <= UPSAMPLED:  # the search's filters remove squares of a few pixels

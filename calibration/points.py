@@ -197,8 +197,7 @@ def _parallax(errors):
 def _moments(name, values, errors):
     """Mean [n, 2], covariance (or scale) [n, 2, 2] and degrees of freedom of a candidate.
 
-    Geometry is taken at the true points: at measured ones, those that erred towards the robot would
-    claim to be the sharper.
+    Geometry is taken at the true points: measured ones too near to the robot would seem sharper.
     """
     zero, at = np.zeros_like(errors.true), errors.true
     if name == "one fitted normal":

@@ -25,9 +25,8 @@ OUTLIER = 5.0  # robust standard deviations
 
 
 class RangeBin(NamedTuple):
-    """Mean and standard deviation of measured minus true, at true ranges `low` to `high` [m], for
-    `count` measurements without the `outliers`. `model_sd`: `bearing_sd` by the fit. NaN without
-    ranges."""
+    """Mean and standard deviation of measured minus true at true ranges `low` to `high` [m], NaN
+    without ranges; `count` excludes the `outliers`. `model_sd`: `bearing_sd` by the fit."""
 
     low: float
     high: float

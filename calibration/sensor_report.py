@@ -17,8 +17,7 @@ SHOWN = 250  # largest number of points drawn: more would cover each other
 
 
 class SensorReport(NamedTuple):
-    """`bearing`: noise of bearings and odometry; `errors` and `models` of the triangulated points,
-    None and empty for a log without points."""
+    """Noise of bearings and odometry; errors and models of points (None, empty without points)."""
 
     bearing: ErrorModel
     errors: PointErrors | None
@@ -56,9 +55,8 @@ def values(report):
 def filter_params(report, base):
     """`Params` for the filter: `base` with the estimated motion and scale of the points' errors.
 
-    `sigma_bearing` stays that of `base`: with noise as small as the lines', the few particles that
-    are drawn close to the truth would take all the weight. For the same reason the estimated
-    `position_scale` multiplies that of `base`.
+    `sigma_bearing` stays that of `base`, and the estimated `position_scale` multiplies that of
+    `base`: with noise as small as the lines', few particles would take all the weight.
     """
     estimated, _ = values(report)
     motion = {k: estimated[k] for k in ODOMETRY if k in estimated}

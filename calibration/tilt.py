@@ -35,9 +35,8 @@ BIWEIGHT = 4.685  # robust standard deviations
 class Tilt:
     """`roll` and `pitch` [rad] of the camera, as in `Camera`, and their `covariance` [2, 2].
 
-    `lines` used of `candidates` in `images` images; `per_image` (name, roll, pitch, lines) of those
-    with enough lines; `scatter` [rad]: robust standard deviation of the lines about the vertical;
-    `skipped` images by reason.
+    `lines` used of `candidates` in `images` images, `skipped` by reason; `per_image` (name, roll,
+    pitch, lines) of those with enough; `scatter` [rad]: robust deviation from the vertical.
     """
 
     roll: float

@@ -136,9 +136,8 @@ def sensor(
     if figure:
         check_new(figure, overwrite, "a picture", ".png")
         if not drive.has("position") or drive.point is None:
-            raise ValueError(
-                f"{log}: has no points to draw; omit --figure, or run jaxslam triangulate first"
-            )
+            remedy = "omit --figure, or run jaxslam triangulate first"
+            raise ValueError(f"{log}: has no points to draw; {remedy}")
     with progress_bar("fitting"):
         report = sensor_report.calibrate_sensor(drive)
     print(sensor_report.text(report))

@@ -52,8 +52,7 @@ class CheckpointOptions(NamedTuple):
 class RunOptions(NamedTuple):
     """What to run and where to write it.
 
-    `name`: the log's name or path as given; `part`: only a part of that log is used; `shared`: by
-    several processes.
+    `name`: the log's name or path; `part`: only part of it is used; `shared`: by several processes.
     """
 
     log: object
@@ -250,9 +249,8 @@ def _run_with_checkpoints(options):
 def _check_log_outside(options):
     """Raise `ValueError` if the log lies in the folder whose files are replaced."""
     if Path(options.name).resolve().is_relative_to(options.out.resolve()):
-        raise ValueError(
-            f"{options.name}: is in {options.out}, where results are replaced; choose another --out"
-        )
+        why = f"is in {options.out}, where results are replaced; choose another --out"
+        raise ValueError(f"{options.name}: {why}")
 
 
 def run_shared(options, address):
@@ -322,9 +320,8 @@ def run_batch(options, seeds, sweep, devices):
     _check_log_outside(options)
     batch.check_target(options.out, options.overwrite)
     with common.progress_bar("running", compiles=True) as progress:
-        results = batch.run_tasks(
-            options.log, options.config, tasks, progress, not options.no_smoothing, devices
-        )
+        smooth = not options.no_smoothing
+        results = batch.run_tasks(options.log, options.config, tasks, progress, smooth, devices)
     with common.progress_bar("writing"):
         batch.save(tasks, results, options.out, options.overwrite, options.source)
     print(batch.format_runs(batch.summary_rows(tasks, results)))

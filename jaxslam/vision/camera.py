@@ -7,9 +7,8 @@ atan2(y, x), counter-clockwise from ahead, and elevation asin(z).
 
 Lengths are normalised by s = half the longer side. `polynomial` is the model of Scaramuzza,
 Martinelli and Siegwart (2006): ray ~ (x, y, a0 + a2 rho^2 + a3 rho^3 ...), with a symmetric affine
-map of the image and two decentring terms for a mirror that is not aligned with the lens; `unified`
-is the sphere model of Mei and Rives (2007) with radial and tangential distortion, as in OpenCV's
-omnidir and Kalibr's omni-radtan.
+map of the image and two decentring terms for a misaligned mirror; `unified` is the sphere model of
+Mei and Rives (2007) with radial and tangential distortion (OpenCV's omnidir, Kalibr's omni-radtan).
 """
 
 import math
@@ -35,10 +34,9 @@ class Camera:
     """A calibrated camera. Raises `ValueError` for invalid values.
 
     `params` [P], named by `parameter_names(model)`: cx, cy, fx, fy, s in px, others without unit;
-    `covariance` [P, P] of them or None. `mirror`: a single mirror, which reverses z. `lens`: where
-    the lens points on the robot, "up" or "down". `yaw`, `roll`, `pitch` [rad] turn the camera about
-    the robot's z, x and y, in this order; `position` (x, y, height) [m] on the robot. `elevation`
-    (low, high) [rad]: usable part of the view.
+    `covariance` [P, P] of them or None. `mirror`: a single mirror, which reverses z. `lens` points
+    "up" or "down". `yaw`, `roll`, `pitch` [rad] turn the camera about the robot's z, x and y, in
+    this order; `position` (x, y, height) [m] on it. `elevation` (low, high) [rad]: usable view.
     """
 
     width: int

@@ -22,9 +22,8 @@ SOFT = 2.0  # pixels from a sharp edge at which its gradient has faded
 class Fit(NamedTuple):
     """Of n segments: `column` (NaN: no peak), its standard deviation `scatter`, and `width`
     (standard deviation of the gradient's profile), in columns of the padded panorama; `slope`
-    [columns per row]; `sign` of the gradient to the right; `strength`, root of the sum of squares
-    of the gradient over the `rows`; `sharp`, 1 - gradient beside / at the edge; `first`, `last`
-    row."""
+    [columns per row]; `sign` of the gradient to the right; `strength`, its root sum of squares over
+    the `rows`; `sharp`, 1 - gradient beside / at the edge; `first` and `last` row."""
 
     column: np.ndarray
     scatter: np.ndarray
@@ -62,17 +61,12 @@ def fit_segments(edges, columns_per_pixel):
     profile = np.stack([np.bincount(block, part) for part in across.T], -1)
     peak, scatter, width = _peak(profile, segment[start], n)
     return Fit(
-        column=centre[np.searchsorted(segment, np.arange(n))] + peak,
-        scatter=scatter,
-        width=width,
-        slope=_slope(edges, n),
-        sign=np.where(np.bincount(segment, along, n) >= 0, 1, -1),
+        column=centre[np.searchsorted(segment, np.arange(n))] + peak, scatter=scatter, width=width,
+        slope=_slope(edges, n), sign=np.where(np.bincount(segment, along, n) >= 0, 1, -1),
         strength=np.sqrt(np.bincount(segment, along**2, n)),
-        rows=np.bincount(segment, minlength=n),
+        rows=np.bincount(segment, minlength=n), first=first, last=last,
         sharp=1 - np.bincount(segment, beside, n) / np.maximum(size, 1e-9),
-        first=first,
-        last=last,
-    )
+    )  # fmt: skip
 
 
 def mean(value, owner, n):

@@ -32,8 +32,7 @@ def find_edges(panorama_image, valid, contrast, significance, length, gap, slope
     """Find the `Edges` of a panorama uint8 [H, W, C] where the mask `valid` [H, W] is set.
 
     Least `contrast` [grey levels per column] and `significance` [in units of the row's noise] of a
-    peak; least `length` and largest `gap` [rows] of a segment, and its largest `slope` [columns per
-    row].
+    peak; least `length`, largest `gap` [rows] and `slope` [columns per row] of a segment.
     """
     padded = _pad(panorama_image)
     channels = panorama_image[0, 0].size  # grey levels are RMS over the channels

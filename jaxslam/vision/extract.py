@@ -224,20 +224,13 @@ def _make_log(images, time, kind, odometry, camera, reach, skipped, name):
     lines = Lines(*(np.concatenate(parts) for parts in zip(*frames, strict=True)))
     colour = lines.colour.reshape(-1, 6)
     return Log(
-        name=name,
-        odometry_time=odometry.time,
-        odometry=odometry.value,
-        odometry_kind=kind,
-        frame_time=time[usable],
-        frame=np.repeat(np.arange(len(usable)), counts),
-        bearing=lines.bearing,
-        bearing_sigma=lines.sigma,
-        descriptor=np.column_stack([lines.low, lines.high, lines.polarity, colour]),
-        view=(-np.pi, np.pi, reach),
+        name=name, skipped=skipped, noise={"detection": DETECTION}, view=(-np.pi, np.pi, reach),
         mounting=(*camera.position[:2], 0.0),  # bearings are relative to the robot's heading
-        noise={"detection": DETECTION},
-        skipped=skipped,
-    )
+        odometry_time=odometry.time, odometry=odometry.value, odometry_kind=kind,
+        frame_time=time[usable], frame=np.repeat(np.arange(len(usable)), counts),
+        bearing=lines.bearing, bearing_sigma=lines.sigma,
+        descriptor=np.column_stack([lines.low, lines.high, lines.polarity, colour]),
+    )  # fmt: skip
 
 
 def _read_truth_folder(folder, skipped):
@@ -288,9 +281,8 @@ class _Overlay:
             try:
                 self.target.mkdir(parents=True, exist_ok=True)
             except OSError as err:
-                raise ValueError(
-                    f"{self.target}: can't be made ({err.strerror}); give a folder, .mp4 or .avi"
-                ) from None
+                why = f"can't be made ({err.strerror}); give a folder, .mp4 or .avi"
+                raise ValueError(f"{self.target}: {why}") from None
         return self
 
     def __exit__(self, *_):

@@ -62,10 +62,8 @@ class ExtractionJournal:
         if settings != self.settings:
             both = set(settings) | set(self.settings)
             changed = sorted(k for k in both if settings.get(k) != self.settings.get(k))
-            raise ValueError(
-                f"{self.path}: was started with other settings ({', '.join(changed)}); use those "
-                "again, or delete it to restart"
-            )
+            fault = f"was started with other settings ({', '.join(changed)})"
+            raise ValueError(f"{self.path}: {fault}; use those again, or delete it to restart")
         self.images = images
         return sum(map(len, lines))
 

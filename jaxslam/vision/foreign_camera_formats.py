@@ -54,10 +54,8 @@ def from_ocamcalib(text):
 def to_ocamcalib(camera):
     """Text of a calib_results.txt. Raises `ValueError` if the format can't hold the camera."""
     if camera.model != "polynomial" or camera["p1"] or camera["p2"]:
-        raise ValueError(
-            "OCamCalib's file holds a polynomial camera without decentring (p1, p2) only;"
-            " calibrate with simple=True"
-        )
+        limit = "without decentring (p1, p2) only; calibrate with simple=True"
+        raise ValueError(f"OCamCalib's file holds a polynomial camera {limit}")
     half, a = max(camera.size) / 2, camera.params[7:]
     powers = np.array([0, *range(2, len(a) + 1)])
     direct = np.zeros(powers[-1] + 1)

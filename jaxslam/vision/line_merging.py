@@ -38,8 +38,7 @@ def merge_pieces(lines, bearing, gap):
 def separate_close_pairs(lines, width):
     """Correct close pairs of opposite polarity, which appear too far apart; `Lines`.
 
-    Their `sigma` grows with the correction. `width` [rad]: standard deviation of the gradient of a
-    sharp edge in this image.
+    Their `sigma` grows with the correction. `width` [rad] of a sharp edge's gradient in this image.
     """
     if len(lines.bearing) < 2:
         return lines
@@ -56,10 +55,8 @@ def separate_close_pairs(lines, width):
     too_far = np.where(pair & (apparent < SEPARATION[-1]), (apparent - true) * width, 0.0)
     push = too_far * share * part * np.sign(apart)
     bearing = lines.bearing - push.sum(axis=1)
-    return lines._replace(
-        bearing=pi - (pi - bearing) % (2 * pi),
-        sigma=np.sqrt(lines.sigma**2 + (too_far**2 * share * part).sum(axis=1) / 4),
-    )
+    sigma = np.sqrt(lines.sigma**2 + (too_far**2 * share * part).sum(axis=1) / 4)
+    return lines._replace(bearing=pi - (pi - bearing) % (2 * pi), sigma=sigma)
 
 
 def _apparent_separation():

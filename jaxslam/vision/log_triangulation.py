@@ -41,9 +41,8 @@ class PointSettings:
 
     Points over the same stretch of road share the error of its odometry, so a filter that assumes
     independent errors becomes overconfident. The log therefore declares a `position_scale`: the
-    square root of `inflation` times the number of overlapping points of a line. Inflating mapped
-    80 % of a simulated room's landmarks where thinning to disjoint pairs mapped 11 %, with equally
-    good paths (experiments/points.py).
+    square root of `inflation` times the number of overlapping points of a line. This mapped 80 % of
+    a simulated room's landmarks, disjoint pairs 11 %, with equal paths (experiments/points.py).
     """
 
     baseline: float = 0.4

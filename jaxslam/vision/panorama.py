@@ -101,9 +101,8 @@ def perspective(camera, azimuth=0.0, elevation=0.0, field=pi / 2, width=640, hei
 def birds_eye(camera, extent=4.0, size=512):
     """`View` of the floor from above with the robot's heading upwards; cached.
 
-    `extent` [m]: half the side of a square around the robot's origin; `size` px. The camera's
-    height is part of its `position`. Black where it does not see the floor. Raises `ValueError` if
-    the height is not above 0.
+    `extent` [m]: half the side of a square around the robot's origin; `size` px. Black where the
+    camera does not see the floor. Raises `ValueError` unless its height (`position`) is above 0.
     """
     if (height := camera.position[2]) <= 0:
         raise ValueError(f"birds_eye: the camera is {height:g} m above the floor; set its height")
