@@ -195,7 +195,7 @@ def summarise_tasks(todo, results):
     told = [run_folder.summarise(result) for result in results]
     there = [name for name in COLUMNS if any(name in summary for summary in told)]
     return [
-        {"seed": task.seed} | task.swept | {name: summary.get(name) for name in there}
+        {"seed": task.seed} | task.told | {name: summary.get(name) for name in there}
         for task, summary in zip(todo, told, strict=True)
     ]
 
@@ -261,7 +261,7 @@ def save(todo, results, folder, overwrite=False, log_source=None):
     try:
         for task, result in zip(todo, results, strict=True):
             name = "-".join(
-                [f"seed-{task.seed}", *(f"{k}-{_shortest(v)}" for k, v in task.swept.items())]
+                [f"seed-{task.seed}", *(f"{k}-{_shortest(v)}" for k, v in task.told.items())]
             )
             run_folder.save(result, partly / name, log_source=log_source, figures=False)
         found = summarise_tasks(todo, results)

@@ -115,7 +115,7 @@ class Checkpoints:
         if kind is KeyboardInterrupt and not error.args and self._files():
             raise KeyboardInterrupt(RESUME_HINT) from None
 
-    def check_run(self, log, config, params, seed):
+    def begin(self, log, config, params, seed):
         """Raise `ValueError` if what there is to go on with is of another run."""
         self._run = {
             **run_fingerprint(log, config, params, seed),
@@ -155,7 +155,7 @@ class Checkpoints:
         sharding.broadcast_int(0)
         return None
 
-    def start_writing(self):
+    def claim(self):
         """From here on the folder is this run's: what others left in it is removed."""
         run_folder.clear_results(self.folder)
         if not self.resume:
@@ -165,7 +165,7 @@ class Checkpoints:
         self._last = time.monotonic()
 
     @contextmanager
-    def defer_signals(self):
+    def watching(self):
         """Within this, the first Ctrl-C (or SIGTERM) only asks to stop; the second ends at once.
 
         By a thread, since Python itself sees no signal while the compiled code runs.
@@ -201,7 +201,7 @@ class Checkpoints:
                 exit_now("interrupted", 130)
             self.stopped = True
 
-    def save_if_due(self, at, total, line):
+    def reached(self, at, total, line):
         """Called after every chunk with `Filtered`: a checkpoint if it is time for one.
 
         `line`: how it goes. Raises `KeyboardInterrupt` if it was asked to stop.
@@ -253,7 +253,7 @@ class FollowerCheckpoints:
     def __init__(self, folder, wait):
         self._place, self._wait = Path(folder) / run_folder.CHECKPOINTS, wait
 
-    def check_run(self, *_):
+    def begin(self, *_):
         """Process 0 has looked."""
 
     def restore(self, shapes):
@@ -267,11 +267,11 @@ class FollowerCheckpoints:
         except ValueError as error:
             raise ValueError(f"{path}: every process of a run has to read it: {error}") from None
 
-    def start_writing(self):
+    def claim(self):
         """Process 0 has it."""
 
     @contextmanager
-    def defer_signals(self):
+    def watching(self):
         """Within this, signals are left to process 0, which gets them, too."""
         signals = signal.SIGINT, signal.SIGTERM
         before = [signal.signal(which, signal.SIG_IGN) for which in signals]
@@ -281,7 +281,7 @@ class FollowerCheckpoints:
             for which, handler in zip(signals, before, strict=True):
                 signal.signal(which, handler)
 
-    def save_if_due(self, at, total, line):
+    def reached(self, at, total, line):
         """Give process 0 what it puts aside."""
         wanted = sharding.broadcast_int(0)
         if wanted:

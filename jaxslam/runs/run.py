@@ -74,7 +74,7 @@ def run(log, config=None, params=None, seed=0, progress=None, refine=True, check
         estimate_memory(config, len(data.time)), config
     )  # before compiling, which takes long
     if checkpoints:
-        checkpoints.check_run(log, config, params, seed)
+        checkpoints.begin(log, config, params, seed)
 
     total, key = len(data.time), jax.random.key(seed)
     at, steps, compile_seconds = (
@@ -93,7 +93,7 @@ def run(log, config=None, params=None, seed=0, progress=None, refine=True, check
         if not at:
             capacity.check_memory(need, config)
     if checkpoints:
-        checkpoints.start_writing()
+        checkpoints.claim()
     if not at:
         state = initial_state(log, config, key)
         at = RunProgress(state, [], Tree() if sharding.is_leader() else None, 0, 0.0, None, [])
@@ -142,7 +142,7 @@ def _filter(steps, key, at, data, params, config, renewal, progress, checkpoints
     """`Filtered` at the end: from where it is `at`, the compiled `steps` over all chunks."""
     total, start, begin = len(data.time), at.done, time.perf_counter() - at.seconds
     session = time.perf_counter()
-    with checkpoints.defer_signals() if checkpoints else nullcontext():
+    with checkpoints.watching() if checkpoints else nullcontext():
         for count, chunk in split_into_chunks(data, config, at.done, renewal.due):
             if at.done in renewal.due:
                 at = _rejuvenate(renewal, key, at, config)
@@ -165,7 +165,7 @@ def _filter(steps, key, at, data, params, config, renewal, progress, checkpoints
             if progress:
                 progress(at.done, total, line)
             if checkpoints:
-                checkpoints.save_if_due(at, total, line)
+                checkpoints.reached(at, total, line)
     return at
 
 

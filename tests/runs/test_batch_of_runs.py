@@ -37,7 +37,7 @@ def state_bytes(config):
 
 def test_each_run_is_bit_for_bit_what_it_is_alone(woods, three):
     config, todo, results = three
-    assert [(task.seed, task.swept) for task in todo] == [
+    assert [(task.seed, task.told) for task in todo] == [
         (1, {"err_rot": 0.05}), (4, {"err_rot": 0.05}), (1, {"err_rot": 0.2}),
     ]  # fmt: skip
     assert len(results) == 3

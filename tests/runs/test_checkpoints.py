@@ -133,7 +133,7 @@ def test_a_broken_checkpoint_is_said_and_the_one_before_it_taken(log, tmp_path, 
         newest.write_bytes(damaged)
         said = []
         with pytest.raises(Stop), offline.Checkpoints(folder, 0, True, say=said.append) as places:
-            places.check_run(log, config, default_params(config.sensor, log), 3)
+            places.begin(log, config, default_params(config.sensor, log), 3)
             assert places.restore(compiled.state_shapes(config)).done == 7
             raise Stop
         assert sum(line.startswith("warning: a broken checkpoint is left aside: ") for line in said)

@@ -238,9 +238,9 @@ def test_it_goes_on_from_a_checkpoint_with_the_same_bits(log, found, tmp_path):
     from jaxslam.runs import checkpoints
 
     class Stopped(checkpoints.Checkpoints):
-        def save_if_due(self, progress, total, line):
-            super().save_if_due(progress, total, line)
-            if progress.done >= total // 2:
+        def reached(self, at, total, line):
+            super().reached(at, total, line)
+            if at.done >= total // 2:
                 raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt), Stopped(tmp_path / "run", 0.0, False, False) as kept:
