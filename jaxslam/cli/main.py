@@ -362,7 +362,7 @@ def guarded(work, at_once=False):
     except OSError as error:
         failed = BUSY if isinstance(error, BlockingIOError) else failed
         failed = FULL if error.errno in NO_SPACE else failed
-        failed = cluster.EXIT_LOST if isinstance(error, ConnectionError) else failed
+        failed = cluster.LOST if isinstance(error, ConnectionError) else failed
         problem = f"{error.filename}: {error.strerror}" if error.filename else str(error)
     except ValueError as error:
         problem = str(error)

@@ -80,7 +80,7 @@ def run_filter(task, checkpoints=None):
 
     with (
         bar("filtering", compiles=True) as progress,
-        cluster.silence_stdout() if task.shared else nullcontext(),
+        cluster.silence_stderr() if task.shared else nullcontext(),
     ):
         result = run.run(
             task.log,
@@ -168,7 +168,7 @@ def run_shared(task, place, guarded):
         "refined": not task.no_refine,
         "versions": run_folder.versions(),
     }
-    team = cluster.ProcessGroup(place, cluster.rendezvous(place, run))
+    team = cluster.Team(place, cluster.rendezvous(place, run))
     code = FAULT
     try:
         code = guarded(lambda: _share(task, place, team))
@@ -187,13 +187,13 @@ def _share(task, place, team):
         if team.leads:
             return run(task)
         follow = offline.FollowerCheckpoints(task.out, team.wait) if task.long else None
-        with cluster.silence_stdout():
+        with cluster.silence_stderr():
             run.run(task.log, task.config, task.params, task.seed, refine=False, checkpoints=follow)
         team.wait()
     except RuntimeError as error:
         if "Gloo" not in str(error):
             raise
-        time.sleep(cluster.EXIT_GRACE)  # whoever died is told meanwhile
+        time.sleep(cluster.GRACE)  # whoever died is told meanwhile
         raise ConnectionError("the connection to another process broke") from None
 
 
@@ -226,7 +226,7 @@ def run_many(task, seeds, sweep, devices):
         )
     with bar("writing"):
         batch.save(todo, results, task.out, task.overwrite, task.source)
-    print(batch.format_runs(batch.summarise_tasks(todo, results)))
+    print(batch.table(batch.summary_rows(todo, results)))
     print(f"{task.out}: the table is {task.out / batch.TABLE}, with a folder for each run")
     for line in dict.fromkeys(line for result in results for line in result.flags):
         warn(line)

@@ -190,7 +190,7 @@ def _scan(keys, states, count, odometry, measurements, params, config, shared_by
     return map_over_devices(one, (keys, states, measurements, params), shared_by)
 
 
-def summarise_tasks(todo, results):
+def summary_rows(todo, results):
     """A dict for every run: seed, what was told, and those of `COLUMNS` that any has (or None)."""
     told = [run_folder.summarise(result) for result in results]
     there = [name for name in COLUMNS if any(name in summary for summary in told)]
@@ -200,7 +200,7 @@ def summarise_tasks(todo, results):
     ]
 
 
-def format_runs(found):
+def table(found):
     """The runs as text; below each set of parameters mean and standard deviation over the seeds."""
     swept = [name for name in found[0] if name != "seed" and name not in COLUMNS]
     shown = [name for name in SHOWN if name in found[0]]
@@ -229,7 +229,7 @@ def _cells(row, names):
     return [format(_value(row[name]), SHOWN[name][1]) for name in names]
 
 
-def _shortest(value):
+def _short(value):
     """A number as text, short if that is still the number."""
     return f"{value:g}" if float(f"{value:g}") == value else repr(float(value))
 
@@ -261,10 +261,10 @@ def save(todo, results, folder, overwrite=False, log_source=None):
     try:
         for task, result in zip(todo, results, strict=True):
             name = "-".join(
-                [f"seed-{task.seed}", *(f"{k}-{_shortest(v)}" for k, v in task.told.items())]
+                [f"seed-{task.seed}", *(f"{k}-{_short(v)}" for k, v in task.told.items())]
             )
             run_folder.save(result, partly / name, log_source=log_source, figures=False)
-        found = summarise_tasks(todo, results)
+        found = summary_rows(todo, results)
         with open(partly / TABLE, "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, found[0])
             writer.writeheader()

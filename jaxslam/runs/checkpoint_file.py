@@ -17,7 +17,7 @@ from jaxslam.logs.log_file import entries_of
 
 FORMAT = 1
 MANIFEST = "manifest"
-PIECE_BYTES = 1 << 20  # bytes at once: checksum and write while they are in cache
+PIECE = 1 << 20  # bytes at once: checksum and write while they are in cache
 
 
 def write_checkpoint(path, about, columns):
@@ -30,13 +30,13 @@ def write_checkpoint(path, about, columns):
     listed = {}
     with atomic_write(path) as file, zipfile.ZipFile(file, "w") as archive:
         for name, parts in columns:
-            listed[name] = _write_entry(archive, name, parts)
+            listed[name] = _put(archive, name, parts)
         text = json.dumps(about | {"format": FORMAT, "arrays": listed})
-        _write_entry(archive, MANIFEST, [np.frombuffer(text.encode(), np.uint8)])
+        _put(archive, MANIFEST, [np.frombuffer(text.encode(), np.uint8)])
     fsync_all(path.parent)
 
 
-def _write_entry(archive, name, parts):
+def _put(archive, name, parts):
     """Write one entry, without a copy of it; gives its line of the manifest."""
     shape, dtype = parts[0].shape, parts[0].dtype
     if len(parts) > 1:
@@ -48,8 +48,8 @@ def _write_entry(archive, name, parts):
         np.lib.format.write_array_header_1_0(member, head)
         for part in parts:
             data = np.ascontiguousarray(part).reshape(-1).view(np.uint8).data
-            for start in range(0, len(data), PIECE_BYTES):
-                piece = data[start : start + PIECE_BYTES]
+            for start in range(0, len(data), PIECE):
+                piece = data[start : start + PIECE]
                 digest.update(piece)
                 member.write(piece)
     return {"shape": list(shape), "dtype": dtype.str, "sha256": digest.hexdigest()}
@@ -62,21 +62,21 @@ def open_checkpoint(path):
     Both raise `ValueError` for whatever is not as it was written.
     """
     with ExitStack() as stack:
-        with _name_file(path):
+        with _blaming(path):
             archive = stack.enter_context(zipfile.ZipFile(path))
-            about = json.loads(_read_entry(archive, MANIFEST, None).tobytes())
+            about = json.loads(_get(archive, MANIFEST, None).tobytes())
             if about["format"] != FORMAT:
                 raise ValueError(f"format {about['format']}; this version reads {FORMAT}")
 
         def get(name):
-            with _name_file(path):
-                return _read_entry(archive, name, about["arrays"][name])
+            with _blaming(path):
+                return _get(archive, name, about["arrays"][name])
 
         yield about, get
 
 
 @contextmanager
-def _name_file(path):
+def _blaming(path):
     try:
         yield
     except MemoryError:  # no fault of the file
@@ -86,7 +86,7 @@ def _name_file(path):
         raise ValueError(f"{path.name}: {reason}") from err
 
 
-def _read_entry(archive, name, line):
+def _get(archive, name, line):
     """The array of one entry; `line`: that of the manifest (None: for the manifest itself)."""
     info = archive.getinfo(name + ".npy")
     with archive.open(info) as member:
@@ -99,8 +99,8 @@ def _read_entry(archive, name, line):
             raise ValueError(f"entry {name} is not what its manifest says")
         array, digest = np.empty(shape, dtype), sha256()
         data = array.reshape(-1).view(np.uint8).data
-        for start in range(0, size, PIECE_BYTES):
-            piece = data[start : start + PIECE_BYTES]
+        for start in range(0, size, PIECE):
+            piece = data[start : start + PIECE]
             if member.readinto(piece) != len(piece):
                 raise ValueError(f"entry {name} ends too soon")
             digest.update(piece)

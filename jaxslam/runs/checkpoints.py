@@ -31,15 +31,15 @@ from jaxslam.results import run_folder, run_lock
 from jaxslam.runs import checkpoint_file, compiled
 from jaxslam.runs import memory as capacity
 from jaxslam.runs.assemble import RunProgress, Summary
-from jaxslam.runs.cluster import exit_now, find_differences
+from jaxslam.runs.cluster import end_now, find_differences
 from jaxslam.smoother.genealogy import Tree
 from jaxslam.smoother.rejuvenation import SharedPast
 
-CHECKPOINTS_KEPT = 2  # checkpoints
+KEPT = 2  # checkpoints
 UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}
-RESUME_HINT = "; go on with the same command and --resume"
+AGAIN = "; go on with the same command and --resume"
 STOP = 2  # what the processes of a run agree on after a chunk: 0 go on, 1 put aside, 2 and end
-IRRELEVANT_FIELDS = ("devices",)  # settings that do not change the result
+NO_MATTER = ("devices",)  # settings that do not change the result
 
 
 def parse_interval(text):
@@ -86,7 +86,7 @@ class Checkpoints:
 
     def __init__(self, folder, every=60.0, resume=False, overwrite=False, say=None):
         self.folder, self.every, self.resume = Path(folder), every, resume
-        self.overwrite, self.say = overwrite, say or _print_stderr
+        self.overwrite, self.say = overwrite, say or _stderr
         self.finished, self.stopped, self._kept, self._lock = False, False, [], None
 
     def __enter__(self):
@@ -113,7 +113,7 @@ class Checkpoints:
                 place.rmdir()
         os.close(self._lock)
         if kind is KeyboardInterrupt and not error.args and self._files():
-            raise KeyboardInterrupt(RESUME_HINT) from None
+            raise KeyboardInterrupt(AGAIN) from None
 
     def begin(self, log, config, params, seed):
         """Raise `ValueError` if what there is to go on with is of another run."""
@@ -125,7 +125,7 @@ class Checkpoints:
         for path in self._files() if self.resume else ():
             try:
                 with checkpoint_file.open_checkpoint(path) as (about, _):
-                    before, versions = _current_names(about["run"]), about["versions"]
+                    before, versions = _current(about["run"]), about["versions"]
             except ValueError as error:
                 self.say(f"warning: a broken checkpoint is left aside: {error}")
                 continue
@@ -142,7 +142,7 @@ class Checkpoints:
         """
         for path in self._readable:
             try:
-                found = _read_progress(path, shapes)
+                found = _read(path, shapes)
             except ValueError as error:
                 self.say(f"warning: a broken checkpoint is left aside: {error}")
                 continue
@@ -190,7 +190,7 @@ class Checkpoints:
             watch.join()
             os.close(ends[0])
         if self.stopped:  # while the last checkpoint was being written
-            raise KeyboardInterrupt(RESUME_HINT)
+            raise KeyboardInterrupt(AGAIN)
 
     def _watch(self, end):
         """Read signals until the other end is closed."""
@@ -198,7 +198,7 @@ class Checkpoints:
             if signs[0] not in (signal.SIGINT, signal.SIGTERM):
                 continue
             if self.stopped:
-                exit_now("interrupted", 130)
+                end_now("interrupted", 130)
             self.stopped = True
 
     def reached(self, at, total, line):
@@ -210,18 +210,18 @@ class Checkpoints:
         wanted = sharding.broadcast_int(STOP if self.stopped else int(due))
         if not wanted:
             return
-        path = _checkpoint_path(self._place, at.done)
+        path = _path(self._place, at.done)
         about = {"run": self._run, "versions": run_folder.versions(), "done": at.done}
         about |= {"seconds": at.seconds, "genealogy": at.tree is not None}
         about |= {"past": at.past is not None}
-        checkpoint_file.write_checkpoint(path, about, _progress_columns(at))
+        checkpoint_file.write_checkpoint(path, about, _columns(at))
         self._kept.append(path)
         self._prune()
         self._last = time.monotonic()
         if not sys.stderr.isatty():
             self.say(f"step {at.done} of {total}, {line}")
         if wanted == STOP:
-            raise KeyboardInterrupt(f" after step {at.done} of {total}{RESUME_HINT}")
+            raise KeyboardInterrupt(f" after step {at.done} of {total}{AGAIN}")
 
     def clear(self):
         """Remove what only an unfinished run needs; the lock goes when this is left."""
@@ -238,7 +238,7 @@ class Checkpoints:
 
     def _prune(self):
         """Keep the last good ones, and nothing else; until there is one, whatever is there."""
-        self._kept = list(dict.fromkeys(self._kept))[-CHECKPOINTS_KEPT:]
+        self._kept = list(dict.fromkeys(self._kept))[-KEPT:]
         for path in self._place.iterdir() if self._kept else ():
             if path not in self._kept:
                 path.unlink()
@@ -261,9 +261,9 @@ class FollowerCheckpoints:
         done = sharding.broadcast_int(0)
         if not done:
             return None
-        path = _checkpoint_path(self._place, done)
+        path = _path(self._place, done)
         try:
-            return _read_progress(path, shapes)
+            return _read(path, shapes)
         except ValueError as error:
             raise ValueError(f"{path}: every process of a run has to read it: {error}") from None
 
@@ -301,7 +301,7 @@ def check_finished(folder, log, config, params, seed):
     if not same:
         raise ValueError(f"{folder}: is finished, but of another log, or part of it")
     before = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8"))
-    if differing := find_differences(_current_names(before), _run_settings(config, params, seed)):
+    if differing := find_differences(_current(before), _settings(config, params, seed)):
         raise ValueError(f"{folder}: is finished, but of another run; differing: {differing}")
 
 
@@ -309,21 +309,21 @@ def run_fingerprint(log, config, params, seed):
     """What a run was told that decides its result, for JSON."""
     return {
         "frames": [len(log.frame_time), *map(int, log.frame_time[[0, -1]])],
-        **_run_settings(config, params, seed),
+        **_settings(config, params, seed),
         "log": checkpoint_file.digest_of_log(log),
     }
 
 
-def _run_settings(config, params, seed):
+def _settings(config, params, seed):
     """`told` but for the log."""
     return {
         "seed": int(seed),
-        "config": {k: v for k, v in vars(config).items() if k not in IRRELEVANT_FIELDS},
+        "config": {k: v for k, v in vars(config).items() if k not in NO_MATTER},
         "params": {k: float(v) for k, v in params._asdict().items()},
     }
 
 
-def _current_names(told):
+def _current(told):
     """Settings as a file holds them, with names of version 0.1 replaced."""
     config = {FORMER_FIELDS.get(name, name): value for name, value in told["config"].items()}
     return told | {"config": config, "params": current_names(told["params"])}
@@ -341,11 +341,11 @@ def _current_entries(get, stored):
     return get_by_either
 
 
-def _checkpoint_path(place, done):
+def _path(place, done):
     return place / f"step-{done:08}.npz"
 
 
-def _name_leaves(state):
+def _names(state):
     """Pairs of a name and a leaf."""
     pairs, _ = jax.tree_util.tree_flatten_with_path(state)
     return [("state" + jax.tree_util.keystr(path), leaf) for path, leaf in pairs]
@@ -353,11 +353,11 @@ def _name_leaves(state):
 
 def _state_columns(state):
     """Names and arrays, of which only one at a time is fetched."""
-    for name, leaf in _name_leaves(state):
+    for name, leaf in _names(state):
         yield name, [sharding.to_host(leaf)]
 
 
-def _progress_columns(at):
+def _columns(at):
     """What a checkpoint holds."""
     yield from _state_columns(at.state)
     yield "entropy", at.entropy
@@ -372,18 +372,18 @@ def _progress_columns(at):
             yield f"tree.{name}", getattr(at.tree, name)
 
 
-def _read_progress(path, shapes):
+def _read(path, shapes):
     """`Filtered` of a checkpoint. Raises `ValueError` if anything in it is not sound."""
     with checkpoint_file.open_checkpoint(path) as (about, get):
         get = _current_entries(get, about["arrays"])
         summary = Summary(*(get(f"summary.{name}") for name in Summary._fields))
-        tree = _read_tree(get) if about["genealogy"] and sharding.is_leader() else None
+        tree = _tree(get) if about["genealogy"] and sharding.is_leader() else None
         past = (
             SharedPast(*(get(f"past.{name}") for name in SharedPast._fields))
             if about["past"]
             else None
         )
-        named, leaves = _name_leaves(shapes), {}
+        named, leaves = _names(shapes), {}
         # The largest first: while an array is copied to the device, it is there twice.
         for name, shape in sorted(named, key=lambda pair: -math.prod(pair[1].shape)):
             array = get(name)
@@ -397,7 +397,7 @@ def _read_progress(path, shapes):
         )
 
 
-def _read_tree(get):
+def _tree(get):
     """The genealogy, level by level; copies, since the levels die one by one."""
     tree, nodes = Tree(), get("tree.nodes")
     ends = np.cumsum(nodes)
@@ -409,5 +409,5 @@ def _read_tree(get):
     return tree
 
 
-def _print_stderr(line):
+def _stderr(line):
     print(line, file=sys.stderr, flush=True)

@@ -18,11 +18,11 @@ from typing import NamedTuple
 
 from jaxslam.config import Config
 
-MEETING_TIMEOUT = 60.0  # seconds in which all must have come
-EXIT_GRACE = 3.0  # seconds in which a process may find by itself why another one ended
-EXIT_LOST = 69  # exit code: a process is missing, or was lost
-REPLY_TIMEOUT = 5.0  # seconds for what takes no time
-MAX_LINE_BYTES = 2**16  # bytes of a line
+LIMIT = 60.0  # seconds in which all must have come
+GRACE = 3.0  # seconds in which a process may find by itself why another one ended
+LOST = 69  # exit code: a process is missing, or was lost
+PATIENCE = 5.0  # seconds for what takes no time
+LONGEST = 2**16  # bytes of a line
 
 
 class ClusterAddress(NamedTuple):
@@ -47,7 +47,7 @@ def find_address(coordinator=None, processes=None, process=None, env=os.environ)
     given = (coordinator, processes, process)
     if given == (None, 1, None):
         return None
-    given = [a if a is not None else b for a, b in zip(given, _read_launcher(env), strict=True)]
+    given = [a if a is not None else b for a, b in zip(given, _from_launcher(env), strict=True)]
     names = "--coordinator", "--num-processes", "--process-id"
     missing = [name for name, value in zip(names, given, strict=True) if value is None]
     if len(missing) == 3:
@@ -67,7 +67,7 @@ def find_address(coordinator=None, processes=None, process=None, env=os.environ)
     return ClusterAddress(found[1].strip("[]"), int(found[2]), processes, process)
 
 
-def _read_launcher(env):
+def _from_launcher(env):
     """Address, processes and process as a launcher tells them; None for what it does not."""
     if int(env.get("SLURM_STEP_NUM_TASKS", 1)) > 1 and "SLURM_PROCID" in env:
         # The first of `node001`, `node001,x2` or `node[001-015,020],x2`.
@@ -89,16 +89,16 @@ def _read_launcher(env):
 _ORTE = "OMPI_MCA_orte_hnp_uri"
 
 
-def rendezvous(place, run, limit=MEETING_TIMEOUT):
+def rendezvous(place, run, limit=LIMIT):
     """Connections to the other processes (of process 0), or to process 0, by process; when all are
     there and were told the same `run`, a dict for JSON.
 
     Raises `ConnectionError`, of one line, on every side if that is not so within `limit` seconds.
     """
-    return _wait_for_all(place, run, limit) if place.process == 0 else {0: _join(place, run, limit)}
+    return _gather(place, run, limit) if place.process == 0 else {0: _call(place, run, limit)}
 
 
-def _wait_for_all(place, run, limit):
+def _gather(place, run, limit):
     """Process 0's side of `meet`: waits for the others."""
     family = socket.AF_INET6 if ":" in place.host else socket.AF_INET
     try:
@@ -117,7 +117,7 @@ def _wait_for_all(place, run, limit):
                 who = "process " + ", ".join(map(str, missing))
                 problem = f"{who} did not come to {place.address} within {limit:g} s"
             else:
-                problem = _admit(link, place, run, found)
+                problem = _greet(link, place, run, found)
     # JAX listens at the port from here on.
     for link in found.values():
         _send(link, f"no {problem}" if problem else "go")
@@ -128,11 +128,11 @@ def _wait_for_all(place, run, limit):
     return found
 
 
-def _admit(link, place, run, found):
+def _greet(link, place, run, found):
     """Take in whoever has called; gives what is wrong about it, or None."""
-    link.settimeout(REPLY_TIMEOUT)
+    link.settimeout(PATIENCE)
     try:
-        told = json.loads(_receive_line(link))
+        told = json.loads(_line(link))
         process, count, other = told["process"], told["processes"], told["run"]
     except (OSError, ValueError, KeyError, TypeError):  # none of ours
         link.close()
@@ -152,7 +152,7 @@ def _admit(link, place, run, found):
     return problem
 
 
-def _join(place, run, limit):
+def _call(place, run, limit):
     """Another process's side of `meet`: calls process 0."""
     end = time.monotonic() + limit
     while True:
@@ -171,9 +171,9 @@ def _join(place, run, limit):
                 ) from None
         time.sleep(0.2)
     _send(link, json.dumps({"process": place.process, "processes": place.processes, "run": run}))
-    link.settimeout(limit + REPLY_TIMEOUT)
+    link.settimeout(limit + PATIENCE)
     try:
-        word, _, why = _receive_line(link).partition(" ")
+        word, _, why = _line(link).partition(" ")
     except OSError:
         word = why = ""
     if word == "go":
@@ -220,7 +220,7 @@ def connect(place):
         ) from None
 
 
-class ProcessGroup:
+class Team:
     """The processes of a run that have met. Process 0 leads: it alone writes and speaks.
 
     Threads listen to the others: if one dies, this process says so and ends at once (exit 69), as
@@ -245,7 +245,7 @@ class ProcessGroup:
     def _listen(self, who, link):
         """Wait for another process's last words."""
         try:
-            word, _, rest = _receive_line(link).partition(" ")
+            word, _, rest = _line(link).partition(" ")
         except OSError:
             word = ""
         if self._ending.is_set() or not self._once.acquire(blocking=False):
@@ -254,16 +254,16 @@ class ProcessGroup:
             lost = rest if word == "lost" else who
             self._tell(f"lost {lost}")
             time.sleep(0.5 if self.leads else 0)  # JAX aborts the others when this has gone
-            exit_now(f"process {lost} died, or the connection to it broke", EXIT_LOST)
+            end_now(f"process {lost} died, or the connection to it broke", LOST)
         code = int(rest)
-        if not self.leads and (code < 2 or self._idle.wait(EXIT_GRACE)):
+        if not self.leads and (code < 2 or self._idle.wait(GRACE)):
             os._exit(code)
         if self.leads:
-            time.sleep(EXIT_GRACE)
+            time.sleep(GRACE)
             code = max(code, 2)  # 1 is that of a run with warnings
             self._tell(f"left {code}")
-            time.sleep(EXIT_GRACE)
-        exit_now(f"process {who} ended with exit code {code}", code)
+            time.sleep(GRACE)
+        end_now(f"process {who} ended with exit code {code}", code)
 
     def _tell(self, line):
         for link in self._links.values() if self.leads else ():
@@ -281,13 +281,13 @@ class ProcessGroup:
         for link in self._links.values():
             _send(link, f"left {code}")
         # Process 0 goes last: JAX aborts the others when it has gone.
-        end = time.monotonic() + REPLY_TIMEOUT
+        end = time.monotonic() + PATIENCE
         for thread in self._threads if self.leads else ():
             thread.join(max(0, end - time.monotonic()))
         os._exit(code)  # JAX's own leave-taking would wait
 
 
-def exit_now(line, code):
+def end_now(line, code):
     """Say one line on stderr and end, whatever else goes on."""
     show = "\x1b[?25h" if sys.stderr.isatty() else ""  # a bar may have hidden the cursor
     os.write(2, f"{show}jaxslam: {line}\n".encode())
@@ -295,7 +295,7 @@ def exit_now(line, code):
 
 
 @contextmanager
-def silence_stdout():
+def silence_stderr():
     """Within this nothing gets to stdout, where Gloo says whom it reached."""
     sys.stdout.flush()
     kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
@@ -308,10 +308,10 @@ def silence_stdout():
         os.close(nowhere)
 
 
-def _receive_line(link):
+def _line(link):
     """The next line that comes, without its end; empty where the other end has closed."""
     parts = b""
-    while len(parts) < MAX_LINE_BYTES:
+    while len(parts) < LONGEST:
         part = link.recv(1)  # what follows the line is left for later
         if part in (b"", b"\n"):
             return parts.decode(errors="replace") if part else ""

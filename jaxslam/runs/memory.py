@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import jax
 
-CGROUP_ROOT = Path("/sys/fs/cgroup")
+GROUPS = Path("/sys/fs/cgroup")
 
 
 class Memory(NamedTuple):
@@ -41,10 +41,10 @@ def _size(leaf):
     shared = leaf.sharding
     if shared is None or shared.num_devices == 1:
         return leaf.size
-    return math.prod(shared.shard_shape(leaf.shape)) * _devices_per_memory(shared.num_devices)
+    return math.prod(shared.shard_shape(leaf.shape)) * _together(shared.num_devices)
 
 
-def _devices_per_memory(devices):
+def _together(devices):
     """How many of a run's devices share the memory that `available` is about."""
     return devices // jax.process_count() if jax.devices()[0].platform == "cpu" else 1
 
@@ -55,7 +55,7 @@ def memory_of_compiled(compiled, memory, config):
     if told is None:  # not every backend says
         return memory
     # The figures are of one device; what several hand over is put together on the host.
-    times = _devices_per_memory(config.devices)
+    times = _together(config.devices)
     handed = times * (told.output_size_in_bytes - told.alias_size_in_bytes)
     inputs = times * told.argument_size_in_bytes - memory.state
     whole = memory.chunk if config.devices > 1 else 0
@@ -125,7 +125,7 @@ def _machine_bytes():
     return told and int(told[1]) * 1024
 
 
-def _cgroup_bytes(groups=CGROUP_ROOT, own=Path("/proc/self/cgroup")):
+def _cgroup_bytes(groups=GROUPS, own=Path("/proc/self/cgroup")):
     """What is left of the limits of this process's control groups, versions 1 and 2."""
     try:
         lines = own.read_text().splitlines()
@@ -143,10 +143,10 @@ def _cgroup_bytes(groups=CGROUP_ROOT, own=Path("/proc/self/cgroup")):
         # In a container the path may be the host's: then the limit is at the base.
         for folder in (place, *place.parents):
             if folder.is_relative_to(base):
-                yield _group_bytes(folder, *names)
+                yield _left(folder, *names)
 
 
-def _group_bytes(folder, limit, usage, cache):
+def _left(folder, limit, usage, cache):
     """Bytes left in one group; file pages that can be dropped count as free. None: no limit."""
     try:
         most = (folder / limit).read_text().strip()

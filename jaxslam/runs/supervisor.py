@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 
-from jaxslam.runs.cluster import EXIT_LOST
+from jaxslam.runs.cluster import LOST
 
 
 def run_supervised():
@@ -45,7 +45,7 @@ def _await(child, told):
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     ours = [line for line in lines if line.startswith("jaxslam: ")][:1]
     if code == -signal.SIGABRT:
-        code, ours = EXIT_LOST, ours or ["jaxslam: process 0 died, or the connection to it broke\n"]
+        code, ours = LOST, ours or ["jaxslam: process 0 died, or the connection to it broke\n"]
     elif code < 0:
         code, ours = 128 - code, [f"jaxslam: killed by signal {-code}\n"]
     if code > 1:

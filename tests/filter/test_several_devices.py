@@ -308,7 +308,7 @@ def test_options_go_before_the_launcher():
 
 
 def test_a_run_is_the_same_whoever_shares_it():
-    one, two = (checkpoints._run_settings(Config(devices=d), default_params(), 0) for d in (1, 2))
+    one, two = (checkpoints._settings(Config(devices=d), default_params(), 0) for d in (1, 2))
     assert one == two
 
 

@@ -53,8 +53,8 @@ def test_each_run_is_bit_for_bit_what_it_is_alone(woods, three):
 
 def test_the_table_has_a_line_for_each_run_and_its_mean_and_spread(three):
     _, todo, results = three
-    found = batch.summarise_tasks(todo, results)
-    lines = batch.format_runs(found).splitlines()
+    found = batch.summary_rows(todo, results)
+    lines = batch.table(found).splitlines()
     assert [line.split()[0] for line in lines] == ["seed", "1", "4", "mean", "sd", "1"]
     evidence = [row["log_likelihood"] for row in found[:2]]
     assert float(lines[3].split()[2]) == pytest.approx(np.mean(evidence), abs=0.06)

@@ -226,10 +226,10 @@ def test_a_full_disk_leaves_the_old_checkpoint_and_an_exit_code(there, call, mon
 
 
 def test_at_most_two_are_kept_and_none_in_the_end(there, call, monkeypatch):
-    counts, tell = [], offline._print_stderr
+    counts, tell = [], offline._stderr
     monkeypatch.setattr(
         offline,
-        "_print_stderr",
+        "_stderr",
         lambda line: (counts.append(len(os.listdir("out/checkpoints"))), tell(line)),
     )
     code, _, err = call(*LONG)

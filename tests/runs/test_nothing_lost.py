@@ -64,9 +64,9 @@ def test_values_of_a_sweep_have_folders_of_their_own(log):
     params = default_params("range_bearing", log)
     todo = batch.plan_tasks("3", params, ["gain_rot=1.0000001,1.0000002,1.0000001"])
     assert len(todo) == 2
-    names = [batch._shortest(task.told["gain_rot"]) for task in todo]
+    names = [batch._short(task.told["gain_rot"]) for task in todo]
     assert names == ["1.0000001", "1.0000002"]
-    assert batch._shortest(0.1) == "0.1"
+    assert batch._short(0.1) == "0.1"
 
 
 def test_many_runs_replace_runs_alone(log, call, refuse):
