@@ -1,8 +1,8 @@
 """Joint bundle adjustment of a camera and the poses of its boards, dense and in double precision.
 
-A residual depends on the camera's parameters and on its own board's pose alone, so the normal
-equations are a dense corner for the camera and 6 x 6 blocks for the boards, which Schur's
-complement removes. JAX differentiates the camera model; the chain through a pose is written out.
+A residual depends only on the camera's parameters and its board's pose, so the normal equations
+have a dense block for the camera and 6 x 6 blocks for the boards, which the Schur complement
+eliminates. JAX differentiates the camera model; derivatives by poses follow by the chain rule.
 """
 
 from dataclasses import dataclass, replace
@@ -14,15 +14,15 @@ import numpy as np
 
 from jaxslam.vision.camera import parameter_names, ray_to_pixel
 
-PAD = 1024  # corners: sets are filled up to multiples of it, so that one compilation serves many
-UNSEEN = 100.0  # px, residual of a corner that the camera does not image
-HUBER = 5.0  # robust standard deviations; beyond, a residual pulls with constant force
-OUTLIER = 10.0  # of the same: such corners are taken out and reported
+PAD = 1024  # corners are padded to multiples of it, so that one compilation serves many sets
+UNSEEN = 100.0  # px, residual of a corner outside the camera's view
+HUBER = 5.0  # robust standard deviations beyond which the cost of a residual is linear
+OUTLIER = 10.0  # robust standard deviations beyond which a corner is excluded and reported
 
 
 @dataclass(frozen=True)
 class Corners:
-    """What is observed: pixels [n, 2], points [n, 2] m on the board, board [n] rising indices."""
+    """Observed corners: `pixel` [n, 2], `point` [n, 2] m on the board, `board` [n], sorted."""
 
     pixel: np.ndarray
     point: np.ndarray
@@ -34,7 +34,7 @@ class Corners:
         return int(self.board[-1]) + 1
 
     def of_boards(self, keep):
-        """Those of the boards `keep` (indices), numbered anew."""
+        """The corners of the boards `keep` (indices), renumbered from 0."""
         part = [self.board == b for b in keep]
         number = np.concatenate([np.full(p.sum(), i) for i, p in enumerate(part)])
         return Corners(
@@ -49,9 +49,9 @@ class Corners:
 class Solution:
     """Camera params [P] and poses of the boards: rotations [B, 3, 3], translations [B, 3] m.
 
-    `free` [P, F]: the directions in which params were free. `residual` [n, 2] px, of every corner;
-    `weight` [n]: 0 where a corner is an outlier. `information` [F, F]: of the free directions, the
-    poses eliminated, per px^2.
+    `free` [P, F]: directions in which params were estimated. `residual` [n, 2] px of every corner;
+    `weight` [n]: 0 for outliers. `information` [F, F] per px^2 of the free directions, with poses
+    eliminated.
     """
 
     params: np.ndarray
@@ -64,7 +64,7 @@ class Solution:
 
     @property
     def distance(self):
-        """Residuals' lengths [n] px."""
+        """Lengths [n] px of the residuals."""
         return np.hypot(*self.residual.T)
 
     @property
@@ -72,48 +72,48 @@ class Solution:
         return float(np.sqrt(np.mean(self.distance**2)))
 
 
-def freedom(model, names):
-    """[P, F]: unit directions of the named parameters; the affine's d and e are one, "e"."""
+def free_directions(model, names):
+    """Directions [P, F] of the named parameters; "e" means d and e of the affine map together."""
     every = parameter_names(model)
     free = np.zeros((len(every), len(names)))
     for column, name in enumerate(names):
         free[every.index(name), column] = 1
-        if name == "e":  # d - e is a rotation about the axis, which the poses have already
+        if name == "e":  # d - e is a rotation about the axis, which the poses include
             free[every.index("d"), column] = 1
     return free
 
 
 @partial(jax.jit, static_argnames=("model", "size"))
 def _derivatives(model, size, params, point):
-    """Pixels [n, 2] of points [n, 3] in the model frame, d pixel/d params, d pixel/d point."""
+    """Pixels [n, 2] of points [n, 3] in the model frame, and derivatives by params and by point."""
 
-    def one(params, point):
+    def project(params, point):
         pixel = ray_to_pixel(model, params, size, point)
         return pixel, pixel
 
-    jacobian, pixel = jax.vmap(jax.jacfwd(one, (0, 1), has_aux=True), (None, 0))(params, point)
+    jacobian, pixel = jax.vmap(jax.jacfwd(project, (0, 1), has_aux=True), (None, 0))(params, point)
     return pixel, *jacobian
 
 
 def derivatives(model, size, params, point):
     """`_derivatives` in double precision, padded; NumPy in and out."""
-    filled = np.zeros((-(-len(point) // PAD) * PAD, 3)) + [0.0, 0.0, 1.0]
-    filled[: len(point)] = point
+    padded = np.zeros((-(-len(point) // PAD) * PAD, 3)) + [0.0, 0.0, 1.0]
+    padded[: len(point)] = point
     with jax.enable_x64(True):
-        given = jnp.asarray(params, jnp.float64), jnp.asarray(filled, jnp.float64)
-        return [np.asarray(part)[: len(point)] for part in _derivatives(model, size, *given)]
+        args = jnp.asarray(params, jnp.float64), jnp.asarray(padded, jnp.float64)
+        return [np.asarray(part)[: len(point)] for part in _derivatives(model, size, *args)]
 
 
 def adjust(model, corners, start, free, steps=60):
-    """Levenberg-Marquardt from a `Solution` over params + `free` and all poses: a `Solution`.
+    """Adjust all poses, and the params along `free` [P, F], by Levenberg-Marquardt: `Solution`.
 
-    Huber's weights times those of `start`; `free` of [P, 0] estimates the poses alone.
+    Huber weights multiply those of `start`; F = 0 estimates the poses alone.
     """
     weight = np.ones(len(corners.pixel)) if start.weight is None else start.weight
-    best = _Linear(model, corners, replace(start, free=free, weight=weight))
+    best = _Linearization(model, corners, replace(start, free=free, weight=weight))
     damping = 1e-3
     for _ in range(steps):
-        moved = _Linear(model, corners, best.step(damping))
+        moved = _Linearization(model, corners, best.step(damping))
         before, after = best.cost(best.scale), moved.cost(best.scale)
         damping = max(damping / 10, 1e-9) if after < before else damping * 10
         if after < before:
@@ -123,30 +123,31 @@ def adjust(model, corners, start, free, steps=60):
     return replace(best.solution, residual=best.residual, information=best.information())
 
 
-class _Linear:
-    """A solution with its residuals [n, 2] px and their derivatives."""
+class _Linearization:
+    """A `Solution` with its residuals [n, 2] px and their derivatives."""
 
     def __init__(self, model, corners, solution):
         self.solution, board = solution, corners.board
         arm = np.einsum("nij,nj->ni", solution.rotation[board][..., :2], corners.point)
         point = arm + solution.translation[board]
-        pixel, camera, place = derivatives(model, corners.size, solution.params, point)
+        pixel, by_params, by_point = derivatives(model, corners.size, solution.params, point)
         seen = np.isfinite(pixel).all(1)[:, None]
         self.residual = np.where(seen, pixel - corners.pixel, UNSEEN)
-        self.camera = np.where(seen[..., None], camera, 0) @ solution.free
-        place = np.where(seen[..., None], place, 0)
-        # d place . (turn x arm) = turn . (arm x d place)
-        self.pose = np.concatenate([np.cross(arm[:, None], place), place], -1)
+        self.camera = np.where(seen[..., None], by_params, 0) @ solution.free
+        by_point = np.where(seen[..., None], by_point, 0)
+        # by_point . (turn x arm) = turn . (arm x by_point)
+        self.pose = np.concatenate([np.cross(arm[:, None], by_point), by_point], -1)
         self.starts = np.flatnonzero(np.diff(board, prepend=-1))
         self.length = np.hypot(*self.residual.T)
         self.scale = robust_scale(self.length[solution.weight > 0])
 
     def cost(self, scale):
+        """Sum of weighted Huber costs at a robust standard deviation `scale` [px]."""
         near, k = self.length, HUBER * scale
         return np.sum(self.solution.weight * np.where(near < k, near**2, 2 * k * near - k * k))
 
     def normal(self):
-        """Blocks of the weighted normal equations: camera, camera to poses, poses; gradients."""
+        """Blocks of the normal equations: camera, camera x poses, poses, and both gradients."""
         huber = np.minimum(1, HUBER * self.scale / np.maximum(self.length, 1e-300))
         root = np.sqrt(self.solution.weight * huber)[:, None]
         r, c, p = root * self.residual, root[..., None] * self.camera, root[..., None] * self.pose
@@ -158,9 +159,9 @@ class _Linear:
         return flat.T @ flat, cross, own, flat.T @ r.ravel(), pull
 
     def step(self, damping):
-        """The solution moved by one damped step."""
+        """The solution after one damped step."""
         camera, cross, own, pull_camera, pull = self.normal()
-        camera, own = _damped(camera, damping), _damped(own, damping)
+        camera, own = _damp(camera, damping), _damp(own, damping)
         solved = np.linalg.solve(own, np.concatenate([cross.mT, pull[..., None]], -1))
         schur = camera - np.einsum("bfj,bjg->fg", cross, solved[..., :-1])
         right = pull_camera - np.einsum("bfj,bj->f", cross, solved[..., -1])
@@ -175,15 +176,13 @@ class _Linear:
         )
 
     def information(self):
-        """[F, F] per px^2: of the camera's free directions, whatever the poses are."""
+        """Information [F, F] per px^2 of the camera's free directions, with poses eliminated."""
         camera, cross, own, _, _ = self.normal()
-        return camera - np.einsum(
-            "bfj,bjg->fg", cross, np.linalg.solve(_damped(own, 0.0), cross.mT)
-        )
+        return camera - np.einsum("bfj,bjg->fg", cross, np.linalg.solve(_damp(own, 0.0), cross.mT))
 
 
 def robust_scale(length):
-    """Standard deviation per axis [px] of 2-D normal residuals with these lengths: the median's."""
+    """Standard deviation [px] per axis of 2-D normal residuals, from their median length."""
     return max(float(np.median(length)) / 1.1774, 1e-6)
 
 
@@ -196,8 +195,8 @@ def rotation(vector):
     return np.eye(3) + np.sinc(angle / np.pi) * k + 0.5 * np.sinc(angle / 2 / np.pi) ** 2 * k @ k
 
 
-def _damped(matrix, damping):
-    """The matrix with its diagonal grown (Marquardt), and never zero."""
+def _damp(matrix, damping):
+    """Increase the diagonal of matrices (Marquardt), and keep it above zero."""
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     least = 1e-12 * np.max(diagonal, initial=1.0)
     return matrix + (damping * diagonal + least)[..., None] * np.eye(matrix.shape[-1])

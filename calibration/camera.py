@@ -1,10 +1,10 @@
 """Calibration of a camera from images of a chessboard: `calibrate_camera`.
 
-Corners -> a first solution by linear equations -> bundle adjustment with a growing model, from the
-two lowest terms of the polynomial up (a start at full order diverges) -> outlier corners found and
-looked for again -> covariance, coverage and bearing uncertainty. The order is the one that predicts
-the corners of left-out boards best: errors of corners are alike within a board, so BIC, which takes
-them for independent, asks for more than that.
+Corners -> an initial solution by linear equations -> bundle adjustment of a growing model, from the
+two lowest terms of the polynomial upwards (starting at full order diverges) -> outlier corners
+removed and localised again -> covariance, coverage and bearing uncertainty. The order is the one
+that best predicts the corners of held-out boards: corner errors are correlated within a board, so
+BIC, which assumes independence, selects too high an order.
 """
 
 import math
@@ -13,15 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.bundle import OUTLIER, Corners, Solution, adjust, freedom, robust_scale
+from calibration.bundle import OUTLIER, Corners, Solution, adjust, free_directions, robust_scale
 from calibration.corners import VARIANTS, board_points, check_board, find_again, find_views
-from calibration.coverage import Bearings, Coverage, bearings, coverage, warnings
+from calibration.coverage import Bearings, Coverage, bearing_uncertainty, coverage, list_warnings
 from calibration.initial import first_solution
 from jaxslam.vision.camera import Camera, parameter_names
 
 LEAST_BOARDS, LEAST_CORNERS = 3, 8
 ORDERS = (4, 5, 6)
-WORST = 1.0  # deg: a calibration whose bearings are less sure than that is refused
+WORST = 1.0  # deg: a calibration with a larger uncertainty of bearings is rejected
 START = ("a0", "a2", "cx", "cy"), ("a3", "a4"), ("c", "e", "p1", "p2")
 UNDETERMINED = "the boards don't determine the camera: place and tilt them differently"
 NOT_SIMPLE = {"polynomial": ("p1", "p2"), "unified": ("s",)}
@@ -29,17 +29,17 @@ NOT_SIMPLE = {"polynomial": ("p1", "p2"), "unified": ("s",)}
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A camera and what supports it. All residuals in px, of every corner, outliers included."""
+    """A camera, and the data that support it. Residuals are in px, of all corners with outliers."""
 
     camera: Camera
     solution: Solution
     corners: Corners
-    names: list  # of the images used, one a board
+    names: list  # of the images used, one per board
     rejected: list  # (name, reason)
     order: int | None
-    scores: dict  # order -> (RMS px, RMS px of boards left out, NaN if not tried)
+    scores: dict  # order -> (RMS px, RMS px of held-out boards, NaN if not tried)
     variant: str  # how the corners were localised
-    again: int  # corners that were outliers and were found again
+    again: int  # outlier corners that were localised again
     coverage: Coverage
     bearings: Bearings
     warnings: list
@@ -54,7 +54,7 @@ class Calibration:
 
     @property
     def per_image(self):
-        """(name, corners, mean, RMS, largest residual px) of each image."""
+        """(name, number of corners, mean, RMS and largest residual px) of each image."""
         rows = []
         for b, name in enumerate(self.names):
             d = self.solution.distance[self.corners.board == b]
@@ -63,7 +63,7 @@ class Calibration:
 
     @property
     def outliers(self):
-        """(name, index of the corner on its board, residual px) of corners that don't count."""
+        """(name, index of the corner on its board, residual px) of the outliers."""
         start = np.searchsorted(self.corners.board, self.corners.board)
         return [
             (self.names[self.corners.board[i]], int(i - start[i]), float(self.solution.distance[i]))
@@ -72,15 +72,15 @@ class Calibration:
 
 
 @contextmanager
-def _determined():
-    """Degenerate boards make some matrix or other singular: say what that means."""
+def _explain_singular():
+    """Translate a singular matrix, which degenerate boards cause, into a `ValueError`."""
     try:
         yield
     except np.linalg.LinAlgError:
         raise ValueError(UNDETERMINED) from None
 
 
-@_determined()
+@_explain_singular()
 def calibrate_camera(
     source,
     board=(6, 7),
@@ -92,29 +92,31 @@ def calibrate_camera(
     simple=False,
     progress=None,
 ):
-    """`Calibration` from images (folder, pattern or list) of a chessboard.
+    """Calibrate a camera from images (folder, pattern or list) of a chessboard: `Calibration`.
 
-    `board`: inner corners along a row and rows; `square` m; `order` of the polynomial: 4 to 6, or
-    None to choose. `simple`: without decentring (polynomial) or skew (unified), for which files of
-    other tools have no room. `progress(done, total)` counts images. Raises `ValueError`.
+    `board`: inner corners (per row, per column); `square` m; `order` of the polynomial: 4 to 6, or
+    None to select it. `simple`: without decentring (polynomial) or skew (unified), which other
+    tools' files can't hold. `progress(done, total)` in images. Raises `ValueError` if too few
+    boards are usable or they don't determine the camera.
     """
     check_board(board, square)
     views = find_views(source, board, progress)
-    _enough(len(views.names), views.rejected)
+    _check_count(len(views.names), views.rejected)
     points = board_points(board, square)
-    given = dict(size=views.size, model=model, mirror=mirror, lens=lens, order=order, simple=simple)
+    options = dict(size=views.size, model=model, mirror=mirror, lens=lens, order=order,
+                   simple=simple)  # fmt: skip
     trials = []
     for variant in VARIANTS:
         corners = _gather(views.corners[variant], points, views.size, views.names)[1]
-        solution = _last(_fits(corners, model, order, simple))
+        solution = _highest_order(_fit_orders(corners, model, order, simple))
         trials.append((_inlier_rms(solution), variant, corners, solution))
     _, variant, corners, solution = min(trials, key=lambda trial: trial[0])
     pixels, again = _find_outliers_again(views.files, corners, solution, board)
-    result = calibrate_corners(pixels, points, names=views.names, **given)
+    result = calibrate_corners(pixels, points, names=views.names, **options)
     return replace(result, variant=variant, again=again, rejected=views.rejected + result.rejected)
 
 
-@_determined()
+@_explain_singular()
 def calibrate_corners(
     pixels,
     points,
@@ -126,31 +128,32 @@ def calibrate_corners(
     simple=False,
     names=None,
 ):
-    """`Calibration` from given corners: `pixels`, a list of [n, 2] px, one a board.
+    """Calibrate a camera from corners: `Calibration`.
 
-    `points`: [n, 2] m on the board, one array for all or a list; boards may be partial. `size`:
-    (width, height). Raises `ValueError`.
+    `pixels`: a list of [n, 2] px, one per board; `points`: [n, 2] m on the board, one array for all
+    or a list; boards may be partial. `size`: (width, height) px. Other arguments and errors as in
+    `calibrate_camera`.
     """
     if model == "polynomial" and order not in (None, *ORDERS):
         raise ValueError(f"order {order!r} of the polynomial: must be 4, 5 or 6")
     names = [f"board {i}" for i in range(len(pixels))] if names is None else list(names)
     names, corners, rejected = _gather(pixels, points, size, names)
-    fits = _fits(corners, model, order, simple)
-    misfit = _misfitting(corners, _last(fits))
+    fits = _fit_orders(corners, model, order, simple)
+    misfit = _find_misfits(corners, _highest_order(fits))
     if misfit:
-        share = "half of its corners are outliers: another board, or corners in a wrong order"
-        rejected += [(names[b], share) for b in misfit]
-        left = [b for b in range(corners.boards) if b not in misfit]
-        names, corners = [names[b] for b in left], corners.of_boards(left)
-        _enough(len(names), rejected)
-        fits = _fits(corners, model, order, simple)
-    order, scores = _choose(corners, fits, model, order, simple)
+        why = "half of its corners are outliers: another board, or corners in a wrong order"
+        rejected += [(names[b], why) for b in misfit]
+        kept = [b for b in range(corners.boards) if b not in misfit]
+        names, corners = [names[b] for b in kept], corners.of_boards(kept)
+        _check_count(len(names), rejected)
+        fits = _fit_orders(corners, model, order, simple)
+    order, scores = _choose_order(corners, fits, model, order, simple)
     solution = fits[order]
-    camera = _camera(solution, corners, model, mirror, lens)
-    cover = coverage(camera, corners, _distances(corners, solution))
-    uncertain = bearings(camera, cover.radius)
-    told = warnings(corners, names, cover, uncertain)
-    _refuse(cover, uncertain, told)
+    camera = _make_camera(solution, corners, model, mirror, lens)
+    cover = coverage(camera, corners, _board_distances(corners, solution))
+    uncertain = bearing_uncertainty(camera, cover.radius)
+    doubts = list_warnings(corners, names, cover, uncertain)
+    _check_bearings(cover, uncertain, doubts)
     return Calibration(
         camera=camera,
         solution=solution,
@@ -163,64 +166,64 @@ def calibrate_corners(
         again=0,
         coverage=cover,
         bearings=uncertain,
-        warnings=told,
+        warnings=doubts,
     )
 
 
-def held_out(corners, fits, model, order=None, simple=False, folds=2):
-    """{order: residuals' lengths [n] px} of boards by cameras that were fitted to the others.
+def cross_validate(corners, fits, model, order=None, simple=False, folds=2):
+    """Predict held-out boards by cameras fitted to the others: {order: residual lengths [n] px}.
 
-    `fits`: {order: `Solution`} of all boards; the poses of those left out are estimated anew, the
-    camera held. `order`: of the polynomial, at most.
+    `fits`: {order: `Solution`} of all boards. The poses of held-out boards are estimated with the
+    camera fixed. `order`: the highest of the polynomial.
     """
     length = {key: np.empty(len(corners.pixel)) for key in fits}
     for fold in range(folds):
         out = np.arange(corners.boards) % folds == fold
-        inside, outside = corners.of_boards(np.flatnonzero(~out)), np.flatnonzero(out)
-        outer = corners.of_boards(outside)
-        cameras = _fits(inside, model, order, simple)
+        fitted, held_out = corners.of_boards(np.flatnonzero(~out)), np.flatnonzero(out)
+        held_out_corners = corners.of_boards(held_out)
+        cameras = _fit_orders(fitted, model, order, simple)
         for key, fit in fits.items():
-            poses = fit.rotation[outside], fit.translation[outside]
+            poses = fit.rotation[held_out], fit.translation[held_out]
             start = Solution(cameras[key].params, *poses)
-            rest = adjust(model, outer, start, freedom(model, ()))
-            length[key][out[corners.board]] = rest.distance
+            predicted = adjust(model, held_out_corners, start, free_directions(model, ()))
+            length[key][out[corners.board]] = predicted.distance
     return length
 
 
-def _choose(corners, fits, model, order, simple):
-    """The order to take and {order: RMS px on boards left out}, outliers left aside."""
-    taken = list(fits)[-1] if order or model == "unified" else next(iter(fits))
+def _choose_order(corners, fits, model, order, simple):
+    """The selected order, and {order: RMS px on held-out boards}, without outliers."""
+    default = list(fits)[-1] if order or model == "unified" else next(iter(fits))
     if corners.boards < 2 * LEAST_BOARDS:
-        return taken, {}
-    good = _last(fits).weight > 0
-    left = held_out(corners, fits, model, order, simple)
-    scores = {key: math.sqrt(np.mean(d[good] ** 2)) for key, d in left.items()}
-    return (taken if order else min(scores, key=scores.get)), scores
+        return default, {}
+    good = _highest_order(fits).weight > 0
+    lengths = cross_validate(corners, fits, model, order, simple)
+    scores = {key: math.sqrt(np.mean(d[good] ** 2)) for key, d in lengths.items()}
+    return (default if order else min(scores, key=scores.get)), scores
 
 
 def _gather(pixels, points, size, names):
-    """Names and `Corners` of the boards that can be used, and the (name, reason) of the others."""
+    """Names and `Corners` of the usable boards, and (name, reason) of the others."""
     if len(pixels) != len(names):
         raise ValueError(f"{len(pixels)} boards but {len(names)} names")
-    one = not isinstance(points, (list, tuple))
+    common = not isinstance(points, (list, tuple))
     kept, rejected = [], []
     for i, (name, pixel) in enumerate(zip(names, pixels, strict=True)):
         pixel = np.asarray(pixel, float)
-        point = np.asarray(points if one else points[i], float)
-        fault = _fault(pixel, point, size)
+        point = np.asarray(points if common else points[i], float)
+        fault = _find_fault(pixel, point, size)
         if fault:
             rejected.append((name, fault))
         else:
             kept.append((name, pixel, point))
-    _enough(len(kept), rejected)
+    _check_count(len(kept), rejected)
     names, pixels, points = zip(*kept, strict=True)
     board = np.repeat(np.arange(len(kept)), [len(p) for p in pixels])
     corners = Corners(np.concatenate(pixels), np.concatenate(points), board, tuple(map(int, size)))
     return list(names), corners, rejected
 
 
-def _fault(pixel, point, size):
-    """Why a board's corners can't be used; None if they can."""
+def _find_fault(pixel, point, size):
+    """The reason why a board's corners can't be used, or None."""
     if pixel.shape != point.shape or pixel.ndim != 2 or pixel.shape[1] != 2:
         return f"{len(pixel)} corners for {len(point)} points of the board"
     if not (np.isfinite(pixel).all() and np.isfinite(point).all()):
@@ -235,50 +238,51 @@ def _fault(pixel, point, size):
     return None
 
 
-def _enough(count, rejected):
+def _check_count(count, rejected):
+    """Raise `ValueError` for too few boards."""
     if count < LEAST_BOARDS:
         why = f"; {rejected[0][0]}: {rejected[0][1]}" if rejected else ""
         raise ValueError(f"{count} usable boards; must be {LEAST_BOARDS} or more{why}")
 
 
-def _grow(corners, simple):
-    """The polynomial of order 4 with affine and decentring, and the names that are free in it."""
+def _fit_order_4(corners, simple):
+    """Fit the polynomial of order 4 with affine map and decentring; `Solution`, names of params."""
     solution, names = first_solution(corners), []
-    solution = adjust("polynomial", corners, solution, freedom("polynomial", ()), steps=10)
-    for more in START:
-        names += [name for name in more if not (simple and name in NOT_SIMPLE["polynomial"])]
-        solution = adjust("polynomial", corners, solution, freedom("polynomial", names))
-    return _without_outliers("polynomial", corners, solution), names
+    solution = adjust("polynomial", corners, solution, free_directions("polynomial", ()), steps=10)
+    for added in START:
+        names += [name for name in added if not (simple and name in NOT_SIMPLE["polynomial"])]
+        solution = adjust("polynomial", corners, solution, free_directions("polynomial", names))
+    return _refit_without_outliers("polynomial", corners, solution), names
 
 
-def _fits(corners, model, order, simple):
-    """{order: `Solution`} up to `order`, or up to the highest; {"unified": ...} of that model."""
-    solution, names = _grow(corners, simple)
+def _fit_orders(corners, model, order, simple):
+    """Fit all orders up to `order` (None: all): {order: `Solution`}, or {"unified": ...}."""
+    solution, names = _fit_order_4(corners, simple)
     if model == "unified":
-        return {model: _unified(corners, solution, simple)}
+        return {model: _fit_unified(corners, solution, simple)}
     fits = {4: solution}
     for higher in range(5, (order or max(ORDERS)) + 1):
         names = [*names, f"a{higher}"]
         start = replace(solution, weight=None)
-        solution = adjust(model, corners, start, freedom(model, names))
-        fits[higher] = solution = _without_outliers(model, corners, solution)
+        solution = adjust(model, corners, start, free_directions(model, names))
+        fits[higher] = solution = _refit_without_outliers(model, corners, solution)
     return fits
 
 
-def _unified(corners, polynomial, simple):
-    """The unified model, begun as a parabolic mirror (xi = 1) that agrees at the centre."""
+def _fit_unified(corners, polynomial, simple):
+    """Fit the unified model, from a parabolic mirror (xi = 1) that agrees at the centre."""
     params = np.zeros(len(parameter_names("unified")))
     focal = polynomial.params[7] * max(corners.size)  # xi = 1: z = (f^2 - rho^2) / (2 f)
     params[:6] = *polynomial.params[:2], focal, focal, 0, 1
     start = replace(polynomial, params=params, weight=None)
-    every = [n for n in parameter_names("unified") if not (simple and n in NOT_SIMPLE["unified"])]
-    for names in (("fx", "fy"), ("fx", "fy", "cx", "cy", "xi"), every):
-        start = adjust("unified", corners, start, freedom("unified", names))
-    return _without_outliers("unified", corners, start)
+    final = [n for n in parameter_names("unified") if not (simple and n in NOT_SIMPLE["unified"])]
+    for names in (("fx", "fy"), ("fx", "fy", "cx", "cy", "xi"), final):
+        start = adjust("unified", corners, start, free_directions("unified", names))
+    return _refit_without_outliers("unified", corners, start)
 
 
-def _without_outliers(model, corners, solution):
-    """The solution fitted again without gross outliers, until they stay the same."""
+def _refit_without_outliers(model, corners, solution):
+    """Exclude outliers and adjust the solution again, until the outliers stay the same."""
     for _ in range(5):
         scale = robust_scale(solution.distance[solution.weight > 0])
         weight = (solution.distance < OUTLIER * scale).astype(float)
@@ -292,27 +296,27 @@ def _inlier_rms(solution):
     return math.sqrt(np.mean(solution.distance[solution.weight > 0] ** 2))
 
 
-def _last(fits):
+def _highest_order(fits):
     """The `Solution` of the highest order."""
     return list(fits.values())[-1]
 
 
-def _distances(corners, solution):
-    """Distance [B] m of the boards, of the middle of what is seen of each."""
+def _board_distances(corners, solution):
+    """Distances [B] m of the boards, each of the mean of its detected corners."""
     middle = [corners.point[corners.board == b].mean(0) for b in range(corners.boards)]
     arm = np.einsum("bij,bj->bi", solution.rotation[..., :2], middle)
     return np.linalg.norm(arm + solution.translation, axis=1)
 
 
-def _misfitting(corners, solution):
-    """Boards with outliers for half of their corners."""
+def _find_misfits(corners, solution):
+    """Indices of the boards of whose corners at least half are outliers."""
     bad = np.bincount(corners.board, solution.weight == 0) / np.bincount(corners.board)
     return np.flatnonzero(bad >= 0.5).tolist()
 
 
 def _find_outliers_again(files, corners, solution, board):
-    """Pixels of every board with outliers replaced by what lies where the camera expects them;
-    the number of those replaced."""
+    """Localise outlier corners again, near where the camera predicts them: the pixels of every
+    board, and the number of corners replaced."""
     pixels, again = [], 0
     for b, file in enumerate(files):
         own = corners.board == b
@@ -325,8 +329,8 @@ def _find_outliers_again(files, corners, solution, board):
     return pixels, again
 
 
-def _camera(solution, corners, model, mirror, lens):
-    """`Camera` with the covariance of its parameters and the elevations that the boards cover."""
+def _make_camera(solution, corners, model, mirror, lens):
+    """`Camera` with the covariance of its parameters and the elevations covered by the boards."""
     information, good = solution.information, solution.weight > 0
     degrees = 2 * good.sum() - solution.free.shape[1] - 6 * corners.boards
     variance = np.sum(solution.distance[good] ** 2) / max(degrees, 1)
@@ -351,9 +355,9 @@ def _camera(solution, corners, model, mirror, lens):
     return replace(camera, elevation=(float(high.min()), float(high.max())))
 
 
-def _refuse(cover, uncertain, told):
-    """Raise `ValueError` for boards that leave the bearings open."""
-    why = "".join(f"; {warning}" for warning in told)
+def _check_bearings(cover, uncertain, doubts):
+    """Raise `ValueError` for boards that leave the bearings too uncertain."""
+    why = "".join(f"; {warning}" for warning in doubts)
     if cover.gap > np.radians(240):
         covered = 360 - np.degrees(cover.gap)
         raise ValueError(f"all corners lie within {covered:.0f}° of azimuth{why}")

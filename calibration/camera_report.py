@@ -1,4 +1,4 @@
-"""What a camera calibration found: a text for the terminal and a picture."""
+"""Report of a camera calibration: a text for the terminal, and a picture."""
 
 from pathlib import Path
 
@@ -9,57 +9,57 @@ from matplotlib.figure import Figure
 from calibration.coverage import RINGS, SECTORS
 from jaxslam.plotting import FILTER, LANDMARK, PLAN, RECKONING, STYLE, TRUE, write_figure
 
-LONGEST = 0.06  # of the image's width: the arrow of the largest residual but outliers
+LONGEST = 0.06  # of the image's width, the arrow of the largest residual without outliers
 
 
-def text(found):
-    """Residuals of every image, what was rejected, coverage, bearing uncertainty, warnings."""
-    camera = found.camera
-    model = camera.model + (f" of order {found.order}" if found.order else "")
-    corners = len(found.corners.pixel)
+def text(fit):
+    """Residuals of every image, rejected images, coverage, bearing uncertainty, and warnings."""
+    camera = fit.camera
+    model = camera.model + (f" of order {fit.order}" if fit.order else "")
+    corners = len(fit.corners.pixel)
     lines = [
-        f"{model}, {camera.width} x {camera.height}: {corners} corners of {len(found.names)} boards"
-        f" ({found.variant})",
+        f"{model}, {camera.width} x {camera.height}: {corners} corners of {len(fit.names)} boards"
+        f" ({fit.variant})",
         "",
-        *_residuals(found),
-        *_rejected(found),
+        *_residuals(fit),
+        *_rejected(fit),
         "",
-        *_coverage(found.coverage),
+        *_coverage(fit.coverage),
         "",
     ]
-    lines += [*_orders(found), ""]
+    lines += [*_orders(fit), ""]
     low, high = np.degrees(camera.elevation)
     lines += [
-        f"bearing uncertainty (1 sigma): {found.bearings.rms_deg:.3f}° RMS,"
-        f" {found.bearings.max_deg:.3f}° at most; elevations covered: {low:.1f}° to {high:.1f}°"
+        f"bearing uncertainty (1 sigma): {fit.bearings.rms_deg:.3f}° RMS,"
+        f" {fit.bearings.max_deg:.3f}° at most; elevations covered: {low:.1f}° to {high:.1f}°"
     ]
-    return "\n".join(lines + [f"warning: {told}" for told in found.warnings])
+    return "\n".join(lines + [f"warning: {warning}" for warning in fit.warnings])
 
 
-def _residuals(found):
-    width = max(len(name) for name in [*found.names, "image"])
+def _residuals(fit):
+    width = max(len(name) for name in [*fit.names, "image"])
     lines = [f"{'image':{width}}  corners  mean   RMS  largest [px]"]
-    for name, count, mean, rms, most in found.per_image:
+    for name, count, mean, rms, most in fit.per_image:
         lines.append(f"{name:{width}}  {count:7} {mean:5.3f} {rms:5.3f}  {most:7.2f}")
-    count, most = len(found.solution.distance), found.solution.distance.max()
-    lines.append(f"{'all':{width}}  {count:7} {found.mean:5.3f} {found.rms:5.3f}  {most:7.2f}")
+    count, most = len(fit.solution.distance), fit.solution.distance.max()
+    lines.append(f"{'all':{width}}  {count:7} {fit.mean:5.3f} {fit.rms:5.3f}  {most:7.2f}")
     return lines
 
 
-def _rejected(found):
-    lines = [f"{found.again} outlier corners were found again"] if found.again else []
+def _rejected(fit):
+    lines = [f"{fit.again} outlier corners were localised again"] if fit.again else []
     lines += [
-        f"outlier left aside: {name}, corner {index}: {distance:.1f} px"
-        for name, index, distance in found.outliers
+        f"outlier excluded: {name}, corner {index}: {distance:.1f} px"
+        for name, index, distance in fit.outliers
     ]
-    return lines + [f"rejected: {name}: {reason}" for name, reason in found.rejected]
+    return lines + [f"rejected: {name}: {reason}" for name, reason in fit.rejected]
 
 
-def _orders(found):
-    lines = ["order    RMS [px]  on boards left out"]
-    for order, (rms, left_out) in found.scores.items():
-        told = f"{left_out:.4f}" if np.isfinite(left_out) else "too few boards"
-        lines.append(f"{order:7}  {rms:8.4f}  {told}{' <' * (order == found.order)}")
+def _orders(fit):
+    lines = ["order    RMS [px]  on held-out boards"]
+    for order, (rms, held_out) in fit.scores.items():
+        score = f"{held_out:.4f}" if np.isfinite(held_out) else "too few boards"
+        lines.append(f"{order:7}  {rms:8.4f}  {score}{' <' * (order == fit.order)}")
     return lines
 
 
@@ -73,15 +73,15 @@ def _coverage(cover):
     return lines
 
 
-def draw(found, path):
+def draw(fit, path):
     """Write the picture: residuals, coverage, radial function, uncertainty of bearings."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(12, 9.4), layout="constrained")
         (residuals, cover), (radial, bearing) = figure.subplots(2, 2)
-        _draw_residuals(residuals, found)
-        _draw_coverage(cover, found)
-        _draw_radial(radial, found)
-        _draw_bearings(figure, bearing, found)
+        _draw_residuals(residuals, fit)
+        _draw_coverage(cover, fit)
+        _draw_radial(radial, fit)
+        _draw_bearings(figure, bearing, fit)
         return write_figure(figure, Path(path))
 
 
@@ -93,36 +93,36 @@ def _image_axes(axes, camera, title):
     axes.plot(*camera.params[:2], "+", ms=10, mew=1.6, color=TRUE, label="centre")
 
 
-def _draw_residuals(axes, found):
-    pixel, residual = found.corners.pixel, found.solution.residual
-    good = found.solution.weight > 0
-    longest = found.solution.distance[good].max()
-    scale = longest / (LONGEST * found.camera.width)
-    title = f"residuals, {1 / scale:.0f} times: mean {found.mean:.3f}, RMS {found.rms:.3f} px"
-    _image_axes(axes, found.camera, title)
+def _draw_residuals(axes, fit):
+    pixel, residual = fit.corners.pixel, fit.solution.residual
+    good = fit.solution.weight > 0
+    longest = fit.solution.distance[good].max()
+    scale = longest / (LONGEST * fit.camera.width)
+    title = f"residuals, {1 / scale:.0f} times: mean {fit.mean:.3f}, RMS {fit.rms:.3f} px"
+    _image_axes(axes, fit.camera, title)
     axes.quiver(
         *pixel[good].T, *residual[good].T, color=FILTER, angles="xy", scale_units="xy",
         scale=scale, width=0.0018, headwidth=4,
     )  # fmt: skip
     if not good.all():
-        axes.plot(*pixel[~good].T, "x", color=LANDMARK, label="outlier left aside")
+        axes.plot(*pixel[~good].T, "x", color=LANDMARK, label="outlier, excluded")
     axes.legend(loc="lower right")
 
 
-def _draw_coverage(axes, found):
-    cover = found.coverage
+def _draw_coverage(axes, fit):
+    cover = fit.coverage
     title = f"coverage: largest gap in azimuth {np.degrees(cover.gap):.0f}°"
-    _image_axes(axes, found.camera, title)
+    _image_axes(axes, fit.camera, title)
     colours = matplotlib.colormaps["viridis"]
-    centre, angle = found.camera.params[:2], np.linspace(0, 2 * np.pi, 181)
+    centre, angle = fit.camera.params[:2], np.linspace(0, 2 * np.pi, 181)
     for i in range(1, RINGS + 1):
         ring = i * cover.radius[1] / RINGS
         axes.plot(*(centre[:, None] + ring * np.stack([np.cos(angle), np.sin(angle)])),
                   color=PLAN, lw=0.7)  # fmt: skip
-    for b in range(found.corners.boards):
-        own = found.corners.pixel[found.corners.board == b]
-        axes.plot(*own.T, ".", ms=4, color=colours(b / max(found.corners.boards - 1, 1)))
-    ring, sector = np.nonzero(cover.count == 0)  # where a board is still wanted
+    for b in range(fit.corners.boards):
+        own = fit.corners.pixel[fit.corners.board == b]
+        axes.plot(*own.T, ".", ms=4, color=colours(b / max(fit.corners.boards - 1, 1)))
+    ring, sector = np.nonzero(cover.count == 0)  # where boards are missing
     rho = (ring + 0.5) * cover.radius[1] / RINGS
     around = -np.pi + (sector + 0.5) * 2 * np.pi / SECTORS
     spots = centre + np.stack([rho * np.cos(around), rho * np.sin(around)], 1)
@@ -130,9 +130,9 @@ def _draw_coverage(axes, found):
     axes.legend(loc="lower right")
 
 
-def _draw_radial(axes, found):
-    """Angle from the axis over radius, and the standard deviations of both angles."""
-    camera, (low, high) = found.camera, found.coverage.radius
+def _draw_radial(axes, fit):
+    """Draw the angle from the axis over radius, and standard deviations of both angles."""
+    camera, (low, high) = fit.camera, fit.coverage.radius
     rho = np.linspace(0, max(camera.size) / 2, 200)
     ray = camera.ray(camera.params[:2] + np.stack([rho, 0 * rho], 1))
     axes.axvspan(low, high, color="#F0F4F8", label="covered by corners")
@@ -141,10 +141,10 @@ def _draw_radial(axes, found):
     axes.set(xlim=(0, rho[-1]), ylim=(0, None))
     axes.set_title("radial function and its uncertainty")
     right = axes.twinx()
-    at = np.hypot(*(found.bearings.pixel - camera.params[:2]).T)[0]
+    at = np.hypot(*(fit.bearings.pixel - camera.params[:2]).T)[0]
     for name, colour, sigma in (
-        ("azimuth", FILTER, found.bearings.sigma),
-        ("angle from the axis", RECKONING, found.bearings.polar),
+        ("azimuth", FILTER, fit.bearings.sigma),
+        ("angle from the axis", RECKONING, fit.bearings.polar),
     ):
         known = np.isfinite(sigma).any(1)
         squared = np.nanmean(np.degrees(sigma[known]) ** 2, axis=1)
@@ -155,11 +155,11 @@ def _draw_radial(axes, found):
     axes.legend(handles=handles, loc="lower right")
 
 
-def _draw_bearings(figure, axes, found):
-    known = found.bearings
-    title = f"σ of azimuth: {known.rms_deg:.3f}° RMS, {known.max_deg:.3f}° at most"
-    _image_axes(axes, found.camera, title)
-    x, y = np.moveaxis(np.concatenate([known.pixel, known.pixel[:, :1]], 1), -1, 0)
-    sigma = np.degrees(known.sigma[:-1])  # of a cell's first corner
+def _draw_bearings(figure, axes, fit):
+    bearings = fit.bearings
+    title = f"σ of azimuth: {bearings.rms_deg:.3f}° RMS, {bearings.max_deg:.3f}° at most"
+    _image_axes(axes, fit.camera, title)
+    x, y = np.moveaxis(np.concatenate([bearings.pixel, bearings.pixel[:, :1]], 1), -1, 0)
+    sigma = np.degrees(bearings.sigma[:-1])  # of a cell's first corner
     mesh = axes.pcolormesh(x, y, sigma, cmap="viridis", vmin=0)
     figure.colorbar(mesh, ax=axes, label="σ of azimuth [°]", shrink=0.8)

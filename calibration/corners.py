@@ -1,7 +1,7 @@
-"""The corners of a chessboard in images; what can't be used is rejected with its reason.
+"""Find the corners of a chessboard in images; unusable images are rejected with a reason.
 
-`board` counts inner corners, (along a row of them, rows), as OpenCV does. Pixels are (u, v), the
-centre of the first at (0, 0).
+`board` is the number of inner corners (per row, per column), as in OpenCV. Pixels are (u, v), with
+the centre of the first at (0, 0).
 """
 
 from collections import Counter
@@ -13,17 +13,17 @@ import numpy as np
 
 from jaxslam.vision.images import Images, read_image
 
-# Without the exhaustive search three boards in ten of a mirror's images are missed.
+# Without the exhaustive search, three in ten boards in images of a mirror camera are missed.
 PLAIN, ACCURATE = cv2.CALIB_CB_EXHAUSTIVE, cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-# Which localises best depends on lens and light (cornerSubPix halves the residual of a fisheye and
-# adds half to a parabolic mirror's): all are made, the calibration's residual decides.
+# The most accurate depends on lens and light (cornerSubPix halves the residual of a fisheye and
+# raises a parabolic mirror's by half), so the calibration's residual selects one.
 VARIANTS = ("search", "upsampled search", "cornerSubPix")
-UPSAMPLED = 8_000_000  # px of the result, at most, when a missed board is looked for twice as large
+UPSAMPLED = 8_000_000  # px, largest image in which to search for a board at twice the size
 SUBPIX_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
 
 
 class Views(NamedTuple):
-    """Images with a board; `corners[variant]`: [n, 2] px of each. `rejected`: (name, reason)."""
+    """Images with a board; `corners[variant]`: a list of [n, 2] px. `rejected`: (name, reason)."""
 
     names: list
     files: list
@@ -33,14 +33,14 @@ class Views(NamedTuple):
 
 
 def board_points(board, square):
-    """Corners [n, 2] of a board on its own plane, in metres, in the order they are found in."""
+    """Corners [n, 2] m of a board in its plane, in the order in which OpenCV finds them."""
     columns, rows = board
     x, y = np.meshgrid(np.arange(columns), np.arange(rows))
     return square * np.stack([x.ravel(), y.ravel()], 1).astype(float)
 
 
 def check_board(board, square):
-    """Raise `ValueError` unless board and square can be a chessboard's."""
+    """Raise `ValueError` unless `board` and `square` [m] describe a chessboard."""
     if len(board) != 2 or any(int(n) != n or not 3 <= n <= 100 for n in board):
         raise ValueError(f"board {tuple(board)}: must be two numbers of inner corners, 3 to 100")
     if not (np.isfinite(square) and square > 0):
@@ -48,16 +48,17 @@ def check_board(board, square):
 
 
 def find_views(source, board, progress=None):
-    """`Views` of a folder, pattern or list of images (or a list of one folder or pattern).
+    """Find boards in a folder, pattern or list of images (also a list of one of these): `Views`.
 
-    All images must have one size: the most frequent. Raises `ValueError` if no board is found.
+    Images that differ from the most frequent size are rejected. `progress(done, total)` in images.
+    Raises `ValueError` if no board is found.
     """
     if isinstance(source, (list, tuple)) and len(source) == 1:
         source = source[0]
-    place = f"{source[0]} and so on" if isinstance(source, (list, tuple)) else source
+    origin = f"{source[0]} and so on" if isinstance(source, (list, tuple)) else source
     images, seen, rejected = Images(source), [], []
     if images.video:
-        raise ValueError(f"{place}: a video; give single images of the board")
+        raise ValueError(f"{origin}: a video; give single images of the board")
     for done, (file, (name, image)) in enumerate(zip(images.files, images, strict=True)):
         if isinstance(image, ValueError):
             rejected.append((name, str(image)))
@@ -67,7 +68,7 @@ def find_views(source, board, progress=None):
         if progress:
             progress(done + 1, len(images))
     if not seen:
-        raise ValueError(f"{place}: no image can be read; the first: {rejected[0][1]}")
+        raise ValueError(f"{origin}: no image can be read; the first: {rejected[0][1]}")
     size = Counter(view[2] for view in seen).most_common(1)[0][0]
     no_board = f"no board of {board[0]} x {board[1]} inner corners found"
     for name, _, (width, height), corners in seen:
@@ -79,7 +80,7 @@ def find_views(source, board, progress=None):
     good = [view for view in seen if view[2] == size and view[3] is not None]
     if not good:
         raise ValueError(
-            f"{place}: {no_board} in any of {len(seen)} images; count where four squares meet,"
+            f"{origin}: {no_board} in any of {len(seen)} images; count where four squares meet,"
             " not the squares"
         )
     names, files, _, found = map(list, zip(*good, strict=True))
@@ -87,24 +88,24 @@ def find_views(source, board, progress=None):
 
 
 def find_corners(grey, board):
-    """Corners [n, 2] by variant of the board in a grey image [H, W], or None."""
+    """Find the board in a grey image [H, W]: corners [n, 2] px by variant, or None."""
     found = find_grid(grey, board, PLAIN)
     accurate = find_grid(grey, board, ACCURATE)
     found = accurate if found is None else found
     if found is None:
         return None
     if accurate is None or np.abs(accurate - found).max() > 0.5 * _spacing(found, board):
-        accurate = found  # missed, or another of the board's two orders: poses would differ
+        accurate = found  # not found, or in the other order of corners: poses would differ
     return dict(zip(VARIANTS, (found, accurate, refine(grey, found, board)), strict=True))
 
 
 def find_grid(grey, board, flags):
-    """Corners [n, 2] px by the chessboard search, or None: in the image, with more local contrast,
-    twice as large, whichever is the first to show them."""
+    """Search for the board in the image, with more local contrast, and at twice the size, until it
+    is found: corners [n, 2] px, or None."""
     for image, scale in _attempts(grey):
         good, corners = cv2.findChessboardCornersSB(image, tuple(board), flags=flags)
         if good:
-            # (n, 1, 2) before OpenCV 5, (n, 2) since. Pixel centres: 2 u + 0.5 in the doubled one.
+            # (n, 1, 2) before OpenCV 5, (n, 2) since. Pixel u is at 2 u + 0.5 at twice the size.
             return (corners.reshape(-1, 2).astype(float) + 0.5) / scale - 0.5
     return None
 
@@ -112,12 +113,12 @@ def find_grid(grey, board, flags):
 def _attempts(grey):
     yield grey, 1
     yield cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey), 1
-    if 4 * grey.size <= UPSAMPLED:  # squares of a few pixels are lost to the search's filters
+    if 4 * grey.size <= UPSAMPLED:  # the search's filters remove squares of a few pixels
         yield cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 2
 
 
 def refine(grey, corners, board):
-    """Corners [n, 2] after cornerSubPix, in windows that hold one corner each."""
+    """Refine corners [n, 2] px by cornerSubPix, in windows that contain one corner each."""
     half = int(np.clip(_spacing(corners, board) / 3, 2, 5))
     start = corners.astype(np.float32).reshape(-1, 1, 2)
     moved = cv2.cornerSubPix(grey, start, (half, half), (-1, -1), SUBPIX_STOP)
@@ -125,11 +126,11 @@ def refine(grey, corners, board):
 
 
 def find_again(file: Path, predicted, board):
-    """Corners [n, 2] px found anew from where a calibration predicts all of a board's."""
+    """Localise the corners [n, 2] px of a board again, from the positions predicted by a camera."""
     return refine(cv2.cvtColor(read_image(file), cv2.COLOR_BGR2GRAY), predicted, board)
 
 
 def _spacing(corners, board):
-    """Distance [px] of the two closest neighbours of the grid."""
+    """Distance [px] of the closest neighbours of the grid."""
     grid = corners.reshape(board[1], board[0], 2)
     return min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1))

@@ -1,4 +1,4 @@
-"""What the boards cover of the image, and how sure the bearings are there."""
+"""Coverage of the image by the boards, and the uncertainty of bearings."""
 
 from typing import NamedTuple
 
@@ -7,24 +7,24 @@ import numpy as np
 from calibration.bundle import derivatives
 
 RINGS, SECTORS = 5, 12
-FROM_AXIS = np.radians(30.0)  # azimuth is judged from here on: it has no meaning on the axis
+FROM_AXIS = np.radians(30.0)  # least angle from the axis, where azimuth is undefined
 GRID = 24  # radii and azimuths of the map of uncertainty
 
 
 class Coverage(NamedTuple):
-    """Corners counted in equal rings of radius and sectors of azimuth [RINGS, SECTORS]."""
+    """Number of corners in equal rings of radius and sectors of azimuth [RINGS, SECTORS]."""
 
     count: np.ndarray
     radius: tuple  # px from the centre: nearest and farthest corner
-    angle: tuple  # rad from the optical axis of these
+    angle: tuple  # rad from the optical axis: least and largest
     gap: float  # rad: the largest range of azimuth without a corner
     distance: np.ndarray  # [B] m of the boards
 
 
 class Bearings(NamedTuple):
-    """Standard deviations, rad [radius, azimuth], on the pixels [.., .., 2] of a polar grid: of
-    azimuth, NaN outside the image and near the axis, and of the angle from the axis. RMS and
-    maximum in degrees, of azimuth."""
+    """Standard deviations [GRID, GRID] rad at the pixels [GRID, GRID, 2] of a polar grid (radius,
+    azimuth): `sigma` of azimuth, NaN outside the image and near the axis, and `polar`, of the angle
+    from the axis. RMS and maximum of `sigma` in degrees."""
 
     sigma: np.ndarray
     polar: np.ndarray
@@ -34,9 +34,9 @@ class Bearings(NamedTuple):
 
 
 def coverage(camera, corners, distance):
-    """`Coverage` of `Corners` whose boards are `distance` [B] m away."""
-    apart = corners.pixel - camera.params[:2]
-    radius, azimuth = np.hypot(*apart.T), np.arctan2(*apart.T[::-1])
+    """`Coverage` of `Corners` on boards at `distance` [B] m."""
+    offset = corners.pixel - camera.params[:2]
+    radius, azimuth = np.hypot(*offset.T), np.arctan2(*offset.T[::-1])
     count, _, _ = np.histogram2d(
         radius, azimuth, (RINGS, SECTORS), ((0, radius.max()), (-np.pi, np.pi))
     )
@@ -55,10 +55,10 @@ def polar_pixels(camera, radius):
 
 
 def angle_change(ray, change):
-    """Change of azimuth (about the model's z) and of the angle from z, [n, k] rad each, when unit
-    rays [n, 3] change by [n, 3, k].
+    """Changes of azimuth (about the model's z) and of the angle from z, [n, k] rad each, of unit
+    rays [n, 3] that change by `change` [n, 3, k].
 
-    The rotation common to all, which the boards' poses and the mounting take up, is removed.
+    The common rotation, which the boards' poses and the mounting absorb, is removed.
     """
     turn = np.cross(np.eye(3)[None], ray[:, None]).transpose(0, 2, 1)  # w x ray = turn @ w
     design, flat = turn.reshape(-1, 3), change.reshape(3 * len(ray), -1)
@@ -72,12 +72,12 @@ def angle_change(ray, change):
 def ray_change(camera, pixel, ray):
     """d ray / d params [n, 3, P] at fixed pixels, by the implicit function theorem."""
     _, by_params, by_ray = derivatives(camera.model, camera.size, camera.params, ray)
-    across = np.linalg.svd(ray[:, None])[2][:, 1:].mT  # [n, 3, 2]: the plane square to the ray
+    across = np.linalg.svd(ray[:, None])[2][:, 1:].mT  # [n, 3, 2]: plane normal to the ray
     return -across @ np.linalg.solve(by_ray @ across, by_params)
 
 
-def bearings(camera, radius):
-    """`Bearings` of a camera with a covariance, within radii (low, high) px."""
+def bearing_uncertainty(camera, radius):
+    """`Bearings` of a camera that has a covariance, within radii (low, high) px."""
     pixel = polar_pixels(camera, radius)
     ray = camera.ray(pixel)
     usable = np.isfinite(ray).all(-1) & (ray[..., 2] < np.cos(FROM_AXIS))
@@ -85,46 +85,46 @@ def bearings(camera, radius):
         usable = np.isfinite(ray).all(-1)
     by_params = angle_change(ray[usable], ray_change(camera, pixel[usable], ray[usable]))
     sigma = np.full((2, *usable.shape), np.nan)
-    for into, by in zip(sigma, by_params, strict=True):
-        into[usable] = np.sqrt(np.einsum("np,pq,nq->n", by, camera.covariance, by).clip(0))
+    for target, by in zip(sigma, by_params, strict=True):
+        target[usable] = np.sqrt(np.einsum("np,pq,nq->n", by, camera.covariance, by).clip(0))
     degrees = np.degrees(sigma[0][usable])
     return Bearings(*sigma, pixel, float(np.sqrt(np.mean(degrees**2))), float(degrees.max()))
 
 
 def azimuth_error(camera, true, radius):
-    """Azimuth error [n] rad of a camera against the true one, the common rotation removed, and
-    its stated standard deviation [n]: at the pixels of `bearings`."""
-    known = bearings(camera, radius)
-    usable = np.isfinite(known.sigma)
-    pixel = known.pixel[usable]
+    """Azimuth error [n] rad of a camera against the true one, without the common rotation, and its
+    standard deviation [n] by `bearing_uncertainty`, at the same pixels."""
+    stated = bearing_uncertainty(camera, radius)
+    usable = np.isfinite(stated.sigma)
+    pixel = stated.pixel[usable]
     ray, real = camera.ray(pixel), true.ray(pixel)
     inside = np.isfinite(real).all(1)
     error = angle_change(real[inside], (ray - real)[inside, :, None])[0][:, 0]
-    return error, known.sigma[usable][inside]
+    return error, stated.sigma[usable][inside]
 
 
-def warnings(corners, names, cover, uncertain):
-    """What is doubtful about a set of boards: sentences for the user."""
-    told = []
+def list_warnings(corners, names, cover, uncertain):
+    """List the weaknesses of a set of boards, in sentences for the user."""
+    found = []
     if corners.boards < 6:
-        told.append(f"only {corners.boards} boards: 10 or more all round are advised")
+        found.append(f"only {corners.boards} boards: 10 or more all round are advised")
     if cover.gap > np.radians(120):
-        told.append(
+        found.append(
             f"no corner in {np.degrees(cover.gap):.0f}° of azimuth: move the board all round"
         )
     if cover.distance.max() < 1.15 * cover.distance.min():
-        told.append("all boards are at one distance: bring some nearer and some farther away")
+        found.append("all boards are at one distance: bring some nearer and some farther away")
     if cover.radius[0] > 0.7 * cover.radius[1]:
-        told.append("the corners lie in one narrow ring: move the board inwards and outwards")
+        found.append("the corners lie in one narrow ring: move the board inwards and outwards")
     if uncertain.rms_deg > 0.1:
-        told.append(f"bearings are known to {uncertain.rms_deg:.2f}° only: take more boards")
+        found.append(f"bearings are known to {uncertain.rms_deg:.2f}° only: take more boards")
     views = [corners.pixel[corners.board == b] for b in range(corners.boards)]
-    twins = []
+    duplicates = []
     for i, view in enumerate(views):
-        same = (view.shape == v.shape and np.abs(view - v).max() < 0.01 for v in views[:i])
-        twins += [(j, i) for j, found in enumerate(same) if found][:1]
-    if twins:
-        more = f" ({len(twins) - 1} more are twice there)" if len(twins) > 1 else ""
-        j, i = twins[0]
-        told.append(f"{names[j]} and {names[i]} are the same picture: one counts twice{more}")
-    return told
+        equal = (view.shape == v.shape and np.abs(view - v).max() < 0.01 for v in views[:i])
+        duplicates += [(j, i) for j, same in enumerate(equal) if same][:1]
+    if duplicates:
+        more = f" ({len(duplicates) - 1} more like this)" if len(duplicates) > 1 else ""
+        j, i = duplicates[0]
+        found.append(f"{names[j]} and {names[i]} are the same picture, which counts twice{more}")
+    return found

@@ -1,14 +1,14 @@
-"""Maximum likelihood of what has normal residuals of mean zero."""
+"""Maximum likelihood for normal residuals of mean zero."""
 
 import numpy as np
 from scipy.optimize import minimize
 
 
 def maximum_likelihood(moments, start, squares):
-    """Parameters and standard errors that fit normal residuals of mean zero best.
+    """Fit parameters [p] to normal residuals of mean zero; returns them and their standard errors.
 
-    `moments(p)`: residuals [n, d] and covariances [n, d, d]. Of the variances among the parameters,
-    listed in `squares`, the roots come back. Errors are by Fisher's information.
+    `moments(p)`: residuals [n, d] and covariances [n, d, d]. Of parameters that are variances, with
+    indices `squares`, square roots are returned. Standard errors are by the Fisher information.
     """
     scale = np.full(len(start), 0.01)
     scale[squares] = np.array(start)[squares]
@@ -30,6 +30,6 @@ def maximum_likelihood(moments, start, squares):
     information += [[np.einsum("nab,nba", a, b) / 2 for b in white] for a in white]
     error = np.sqrt(np.diag(np.linalg.pinv(information)))
     best[squares] = np.sqrt(best[squares])
-    # Next to zero the root is no straight line: what is known is how far up it may go.
+    # Near zero the square root is not linear: the error is limited to the variance's own root.
     error[squares] = np.minimum(error[squares] / (2 * best[squares]), np.sqrt(error[squares]))
     return best, error

@@ -1,4 +1,4 @@
-"""The odometry's part of the error model: increments against true poses."""
+"""Error model of the odometry, from increments and true poses."""
 
 from dataclasses import replace
 
@@ -9,23 +9,26 @@ from jaxslam.logs.odometry import increments
 from jaxslam.logs.truth import truth_at, wrap
 from jaxslam.parameters import default_params
 
-LEAST = 30  # measurements, and intervals of odometry, below which nothing is estimated
-GAP = 0.25  # s between two true poses, across which a pose may be interpolated
+LEAST = 30  # least number of measurements, and of intervals of odometry, for an estimate
+GAP = 0.25  # s, longest time between two true poses to interpolate across
 ODOMETRY = ("gain_tran", "gain_rot", "bias_drift", "err_tran", "err_rot", "err_drift")
 
 
 def require(log, met, what):
+    """Raise `ValueError` naming `what` the log lacks, unless the condition is `met`."""
     if not met:
         raise ValueError(f"{log.name}: calibration needs {what}; this log lacks them")
 
 
 def fit_odometry(log, interval):
-    """Values and standard errors by name, the drive's yaw (value, error), number of intervals.
+    """Fit the odometry in intervals of `interval` s: values and standard errors by name, yaw of the
+    drive (value, standard error) [rad], number of intervals.
 
-    Of a straight drive nothing is learnt about turns: `gain_rot` and `err_rot` are then left out.
+    `gain_rot` and `err_rot` are left out for a straight drive, which says nothing about turns.
+    Raises `ValueError` naming what the log lacks.
     """
     o, before, after = _intervals(log, interval)
-    require(log, o.distance.sum() >= 1, "odometry with at least 1 m driven, where truth is")
+    require(log, o.distance.sum() >= 1, "odometry with at least 1 m driven between true poses")
     declared = default_params("bearing", log)
     floors = declared.floor_tran**2 * o.duration, declared.floor_rot**2 * o.duration
     start = np.array([1, 1, 0, 0.02**2, 0.02**2, 0.02**2, 0])
@@ -33,9 +36,9 @@ def fit_odometry(log, interval):
     free = [i for i in range(7) if turns or i not in (1, 4)]
 
     def moments(p):
-        every = start.copy()
-        every[free] = p
-        return motion_residuals(every, o, before, after, floors)
+        params = start.copy()
+        params[free] = p
+        return motion_residuals(params, o, before, after, floors)
 
     squares = [free.index(i) for i in (3, 4, 5) if i in free]
     best, error = maximum_likelihood(moments, start[free], squares)
@@ -45,12 +48,12 @@ def fit_odometry(log, interval):
 
 
 def _intervals(log, interval):
-    """`Odometry` of intervals between true poses [n], and the poses [n, 3] at their two ends."""
-    moving = log.odometry_time
-    # A command is executed at its stamp: in between there is no saying how far it got.
-    stamps = log.truth.time if log.odometry_kind == "velocity" else moving
+    """`Odometry` of n intervals between true poses, and the poses [n, 3] at both ends."""
+    driven = log.odometry_time
+    # A command acts at its stamp: between stamps its progress is unknown.
+    stamps = log.truth.time if log.odometry_kind == "velocity" else driven
     pose = truth_at(log.truth, stamps, GAP)
-    usable = np.isfinite(pose).all(1) & (stamps >= moving[0]) & (stamps <= moving[-1])
+    usable = np.isfinite(pose).all(1) & (stamps >= driven[0]) & (stamps <= driven[-1])
     stamps, pose, ends, end = stamps[usable], pose[usable], [], 0
     while end < len(stamps):
         ends.append(end)
@@ -62,15 +65,15 @@ def _intervals(log, interval):
     bare |= {"frame": np.empty(0, int), "bearing": np.empty(0)}
     odometry = increments(replace(log, frame_time=stamps, **bare))
     length = np.diff(stamps)
-    kept = length <= 2 * max(interval * 1e9, np.median(length))  # not across a hole in the truth
+    kept = length <= 2 * max(interval * 1e9, np.median(length))  # not across gaps of the truth
     return type(odometry)(*(leaf[1:][kept] for leaf in odometry)), pose[:-1][kept], pose[1:][kept]
 
 
 def motion_residuals(p, o, before, after, floors):
     """Errors [n, 3] along, across and in heading, and covariances [n, 3, 3], as `motion.model`.
 
-    `p`: gains (translation, rotation), drift's bias, squares of err_tran, err_rot and err_drift,
-    and the drive's yaw.
+    `p` [7]: gains (translation, rotation), bias of the drift, squares of err_tran, err_rot and
+    err_drift, and the yaw of the drive.
     """
     gain_tran, gain_rot, bias, tran, rot, drift, yaw = p
     length = gain_tran * np.hypot(o.dx, o.dy)

@@ -1,9 +1,9 @@
-"""The error of triangulated points: the paper's procedure, and which model the data prefer.
+"""Error of triangulated points: the paper's procedure, and a comparison of error models.
 
-Drive straight past surveyed lines with images at known distances, triangulate, and look at how the
-points lie about the lines (paper, section III-B3 and fig. 6). Candidates are fitted on one half of
-the drive and scored on the other, both ways round, by their log density per point; the filter is
-the second judge: `with_model` writes a candidate's covariances into any log of points.
+Drive straight past surveyed lines with images at known distances, triangulate, and compare the
+points with the lines (paper, section III-B3 and fig. 6). Models are fitted to one half of the drive
+and scored on the other, and vice versa, by their log density per point. They can also be compared
+in the filter: `apply_model` writes a model's covariances into any log of points.
 """
 
 from dataclasses import replace
@@ -16,13 +16,13 @@ from scipy.special import gammaln
 from calibration.odometry import GAP, LEAST, require
 from jaxslam.logs.truth import truth_at, wrap
 
-NEAR = np.radians(1.0)  # a line within this of a surveyed one's true bearing may be that one
-GROSS = 100.0  # squared Mahalanobis distance beyond which a point is another line's
+NEAR = np.radians(1.0)  # largest difference of bearing from that of the same surveyed line
+GROSS = 100.0  # squared Mahalanobis distance beyond which a point is a gross error
 
 
 class PointErrors(NamedTuple):
-    """Of n points: `row` in the log, `frame`, `point` and `true` [n, 2] in the sensor's frame,
-    `cov` [n, 2, 2] as propagated, `baseline` [n] m, and `counts` of what was left out."""
+    """Of n points: `row` in the log, `frame`, `point` and `true` [n, 2] m in the sensor's frame,
+    `cov` [n, 2, 2] as propagated, `baseline` [n] m, and `counts` of points by kind."""
 
     row: np.ndarray
     frame: np.ndarray
@@ -33,11 +33,12 @@ class PointErrors(NamedTuple):
     counts: dict[str, int]
 
     def part(self, chosen):
+        """The points selected by an index or mask."""
         return self._replace(**{k: getattr(self, k)[chosen] for k in self._fields[:-1]})
 
 
 class Model(NamedTuple):
-    """A fitted candidate: its parameters, nats per held-out point, and 95 % ellipses' coverage."""
+    """A fitted error model: parameters, nats per held-out point, coverage of the 95 % ellipses."""
 
     name: str
     values: dict[str, float]
@@ -48,9 +49,9 @@ class Model(NamedTuple):
 def point_errors(log, gain=1.0):
     """`PointErrors` of a log with points, true poses and surveyed lines.
 
-    `gain`: true over measured distance, by which points that rest on odometry are scaled. A point's
-    line is the one at its identity, else the likeliest within a degree of its bearing, as seen from
-    the true pose. Raises `ValueError` naming what the log lacks.
+    `gain`: true over measured distance, by which the points are scaled. The line of a point is that
+    of its true identity, or else the most likely within a degree of its bearing from the true pose.
+    Raises `ValueError` naming what the log lacks.
     """
     truth = log.truth
     require(log, truth is not None and truth.time is not None, "true poses")
@@ -60,15 +61,15 @@ def point_errors(log, gain=1.0):
     pose = truth_at(truth, log.frame_time, GAP)[log.frame[rows]]
     rows, pose = rows[np.isfinite(pose).all(1)], pose[np.isfinite(pose).all(1)]
     require(log, len(rows) >= LEAST, f"at least {LEAST} points where there are true poses")
-    point, cov = gain * log.point[rows], gain**2 * _full(log.point_cov[rows])
+    point, cov = gain * log.point[rows], gain**2 * _to_matrices(log.point_cov[rows])
     lines = in_sensor(log, pose, truth.landmarks)
     off = point[:, None] - lines
     distance = np.einsum("nli,nij,nlj->nl", off, np.linalg.inv(cov), off)
     turn = np.arctan2(lines[..., 1], lines[..., 0]) - np.arctan2(point[:, 1], point[:, 0])[:, None]
-    candidate = np.abs(wrap(turn)) < NEAR
+    possible = np.abs(wrap(turn)) < NEAR
     if truth.identity is not None and truth.landmark_id is not None:
-        candidate = truth.identity[rows][:, None] == truth.landmark_id
-    distance = np.where(candidate, distance, np.inf)
+        possible = truth.identity[rows][:, None] == truth.landmark_id
+    distance = np.where(possible, distance, np.inf)
     nearest = distance.argmin(1)
     least = distance[np.arange(len(rows)), nearest]
     kept = least < GROSS
@@ -80,15 +81,15 @@ def point_errors(log, gain=1.0):
     require(log, kept.sum() >= LEAST, f"at least {LEAST} points near surveyed lines")
     base = np.full(len(rows), np.nan) if log.point_baseline is None else log.point_baseline[rows]
     true = lines[np.arange(len(rows)), nearest]
-    every = PointErrors(rows, log.frame[rows], point, true, cov, gain * base, counts)
-    return every.part(kept)
+    errors = PointErrors(rows, log.frame[rows], point, true, cov, gain * base, counts)
+    return errors.part(kept)
 
 
-def identified(log):
-    """The log with true identities: each bearing's is the surveyed line nearest to it.
+def identify_lines(log):
+    """Add true identities to a log: of each bearing, the surveyed line nearest to it.
 
-    As seen from the true pose; -1 (nothing) where none is within a degree. For lines from images,
-    which nobody has labelled. Raises `ValueError` naming what the log lacks.
+    Bearings are from the true pose; -1 (clutter) if no line is within a degree. For lines from
+    images, which have no identities. Raises `ValueError` naming what the log lacks.
     """
     truth = log.truth
     require(log, truth is not None and truth.time is not None, "true poses")
@@ -98,20 +99,20 @@ def identified(log):
     off = np.abs(wrap(log.bearing[:, None] - np.arctan2(lines[..., 1], lines[..., 0])))
     off = np.where(np.isfinite(off), off, np.inf)
     ids = np.arange(len(truth.landmarks)) if truth.landmark_id is None else truth.landmark_id
-    found = np.where(off.min(axis=1) < NEAR, ids[off.argmin(axis=1)], -1)
-    return replace(log, truth=replace(truth, landmark_id=ids, identity=found))
+    identity = np.where(off.min(axis=1) < NEAR, ids[off.argmin(axis=1)], -1)
+    return replace(log, truth=replace(truth, landmark_id=ids, identity=identity))
 
 
 def coverage(errors):
-    """Share of the points within their own 95 % ellipse, as propagated."""
-    return float((_square("propagated normal", (1.0,), errors) < _bound95(np.inf)).mean())
+    """Share of the points within the 95 % ellipse of their propagated covariance."""
+    return float((_squared_distance("propagated normal", (1.0,), errors) < _bound95(np.inf)).mean())
 
 
 def compare(errors):
-    """`Model`s of all candidates, the preferred one first; fitted on all points, scored two-fold.
+    """Compare all candidates: `Model`s fitted to all points, best held-out log density first.
 
-    The halves are the first and the second half of the drive's frames, since errors of neighbouring
-    frames are alike. Raises `ValueError` when there are too few points.
+    Scores are by two-fold cross-validation between the first and the second half of the frames,
+    since errors of neighbouring frames are correlated. Raises `ValueError` for too few points.
     """
     if len(errors.row) < 2 * LEAST:
         raise ValueError(f"error model: {len(errors.row)} points; at least {2 * LEAST} are needed")
@@ -126,20 +127,22 @@ def compare(errors):
             scores.append(_log_density(name, values, errors.part(half)))
         values = _fit(name, errors)
         dof = _moments(name, values, errors)[2]
-        covered = _square(name, values, errors) < _bound95(dof)
-        named = dict(zip(CANDIDATES[name][0], values.tolist(), strict=True))
-        models.append(Model(name, named, float(np.concatenate(scores).mean()), covered.mean()))
+        covered = _squared_distance(name, values, errors) < _bound95(dof)
+        by_name = dict(zip(CANDIDATES[name][0], values.tolist(), strict=True))
+        models.append(Model(name, by_name, float(np.concatenate(scores).mean()), covered.mean()))
     return sorted(models, key=lambda model: -model.held_out)
 
 
-def with_model(model, log):
-    """The log with its points' covariances (and a fitted mean taken off) as the model has them."""
+def apply_model(model, log):
+    """Replace the covariances of a log's points by a model's, and subtract a fitted mean."""
     rows = np.flatnonzero(np.isfinite(log.point).all(1))
     point, base = log.point[rows], log.point_baseline
     base = np.full(len(rows), np.nan) if base is None else base[rows]
-    empty = PointErrors(rows, log.frame[rows], point, point, _full(log.point_cov[rows]), base, {})
+    empty = PointErrors(
+        rows, log.frame[rows], point, point, _to_matrices(log.point_cov[rows]), base, {}
+    )
     mean, cov, dof = _moments(model.name, np.array(list(model.values.values())), empty)
-    if np.isfinite(dof):  # the filter's update is a normal's: give it the tail's variance
+    if np.isfinite(dof):  # the filter assumes a normal: use the variance of Student's t
         cov = cov * dof / max(dof - 2, 0.5)
     points, covs = log.point.copy(), log.point_cov.copy()
     points[rows] = point - mean
@@ -158,20 +161,21 @@ def in_sensor(log, pose, landmarks):
     return np.stack([c * dx + s * dy, c * dy - s * dx], -1)
 
 
-def _full(cov):
+def _to_matrices(cov):
+    """Covariances [n, 2, 2] from (xx, xy, yy) [n, 3]."""
     xx, xy, yy = cov.T
     return np.stack([xx, xy, xy, yy], -1).reshape(-1, 2, 2)
 
 
-def _sight(point):
-    """[n, 2, 2]: columns are the unit vectors along and across the line of sight."""
+def _sight_axes(point):
+    """Unit vectors along and across the line of sight, as columns [n, 2, 2]."""
     along = point / np.linalg.norm(point, axis=1, keepdims=True)
     return np.stack([along, np.stack([-along[:, 1], along[:, 0]], 1)], -1)
 
 
 def _along_across(point, along, across, both=0.0):
     """Covariances [n, 2, 2] from variances along and across the line of sight."""
-    frame = _sight(point)
+    frame = _sight_axes(point)
     inner = np.zeros((len(point), 2, 2))
     inner[:, 0, 0], inner[:, 1, 1] = along, across
     inner[:, 0, 1] = inner[:, 1, 0] = both
@@ -179,9 +183,9 @@ def _along_across(point, along, across, both=0.0):
 
 
 def _parallax(errors):
-    """[n, 2, 2]: covariance for a bearing noise of 1 rad on both rays of a straight drive.
+    """Covariance [n, 2, 2] for a bearing noise of 1 rad on both rays of a straight drive.
 
-    The second sensor is at the origin, the first one baseline behind. An error of one bearing moves
+    The second sensor is at the origin, the first one baseline behind. An error of a bearing moves
     the point along the other ray, by range / sin(parallax) per radian.
     """
     first = errors.true + np.column_stack([errors.baseline, np.zeros(len(errors.true))])
@@ -189,8 +193,8 @@ def _parallax(errors):
     u1, u2 = first / r1[:, None], errors.true / r2[:, None]
     sine = u1[:, 0] * u2[:, 1] - u1[:, 1] * u2[:, 0]
     sine = np.where(np.abs(sine) < 1e-4, 1e-4, sine)
-    one, other = (r2 / sine)[:, None] * u1, (r1 / sine)[:, None] * u2
-    return one[:, :, None] * one[:, None] + other[:, :, None] * other[:, None]
+    by_b2, by_b1 = (r2 / sine)[:, None] * u1, (r1 / sine)[:, None] * u2
+    return by_b2[:, :, None] * by_b2[:, None] + by_b1[:, :, None] * by_b1[:, None]
 
 
 def _moments(name, values, errors):
@@ -202,7 +206,7 @@ def _moments(name, values, errors):
     zero, at = np.zeros_like(errors.true), errors.true
     if name == "one fitted normal":
         mean_along, mean_across, along, across, slope = values
-        mean = (_sight(at) @ np.array([mean_along, mean_across])[:, None])[..., 0]
+        mean = (_sight_axes(at) @ np.array([mean_along, mean_across])[:, None])[..., 0]
         both = slope * along
         cov = _along_across(at, along**2, across**2 + slope**2 * along**2, both * along)
         return mean, cov, np.inf
@@ -231,7 +235,7 @@ CANDIDATES = {
 
 
 def _fit(name, errors):
-    """Values [p] of a candidate by maximum likelihood."""
+    """Fit the parameters [p] of a candidate by maximum likelihood."""
     _, start, positive = CANDIDATES[name]
     positive = np.array(positive)
 
@@ -248,7 +252,7 @@ def _fit(name, errors):
     return values(best.x)
 
 
-def _square(name, values, errors):
+def _squared_distance(name, values, errors):
     """Squared distance [n] of the errors in units of a candidate's covariance."""
     mean, cov, _ = _moments(name, values, errors)
     off = errors.point - errors.true - mean
@@ -258,7 +262,7 @@ def _square(name, values, errors):
 def _log_density(name, values, errors):
     """Log density [n] of the errors: normal, or Student's t with `dof` degrees of freedom."""
     _, cov, dof = _moments(name, values, errors)
-    square = _square(name, values, errors)
+    square = _squared_distance(name, values, errors)
     half = -np.linalg.slogdet(cov)[1] / 2 - np.log(2 * np.pi)
     if np.isinf(dof):
         return half - square / 2

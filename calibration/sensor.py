@@ -1,13 +1,13 @@
-"""Drives -> error model: sensor and odometry noise from a log whose truth is known.
+"""Error model of sensor and odometry, from a log whose truth is known.
 
-Residuals against the truth are fitted by maximum likelihood with the filter's own models: `sensors`
-(a bearing's noise grows at short range) and `motion`. Read the result for what it is:
-- Truth is needed: poses, landmarks, which measurement saw which. Its own error counts as noise.
-- Residuals are taken for white noise. Real ones are not (a tube is seen off its centre as long as
-  the robot stands on one side of it): the standard errors are then too small, and a filter, which
-  multiplies the densities of many frames, needs wider values than these.
-- A controller that answers to the odometry's errors within an interval biases the gains (the turns
-  it commands undo the noise): drive by hand, or blindly.
+Residuals against the truth are fitted by maximum likelihood with the filter's models `sensors`
+(where the noise of bearings grows at short range) and `motion`. Limits:
+- Truth is needed: poses, landmarks and identities. Its errors count as noise.
+- Residuals are assumed white, but real ones are not (a tube is seen off its centre as long as the
+  robot is on one side of it). Standard errors are then too small, and a filter, which multiplies
+  the densities of many frames, needs larger values.
+- A controller that reacts to errors of the odometry within an interval biases the gains, since its
+  turns cancel noise. Drive by hand, or without feedback.
 """
 
 from dataclasses import dataclass, replace
@@ -20,13 +20,14 @@ from calibration.likelihood import maximum_likelihood
 from calibration.odometry import GAP, LEAST, fit_odometry, require
 from jaxslam.logs.truth import truth_at, wrap
 
-COARSEST = 0.02  # m; truth read off anything coarser tells nothing of these errors
+COARSEST = 0.02  # m, coarsest resolution of a truth from which these errors can be found
 OUTLIER = 5.0  # robust standard deviations
 
 
 class RangeBin(NamedTuple):
-    """Measured minus true, at true ranges `low` to `high` [m], outliers (but for `outliers`, their
-    number) left out. `model_sd`: what the fit says of `bearing_sd`. NaN without ranges."""
+    """Mean and standard deviation of measured minus true, at true ranges `low` to `high` [m], for
+    `count` measurements without the `outliers`. `model_sd`: `bearing_sd` by the fit. NaN without
+    ranges."""
 
     low: float
     high: float
@@ -43,8 +44,8 @@ class RangeBin(NamedTuple):
 class ErrorModel:
     """`values` of `Params` with `standard_errors`, by name; `counts` by kind; residuals `by_range`.
 
-    `interval`: s of odometry at a time. `drive_yaw` (value, standard error): direction in which the
-    robot drives, in the frame of its true headings. The filter takes it for zero: see `turn_frame`.
+    `interval` s of odometry. `drive_yaw` rad (value, standard error): direction in which the robot
+    drives, relative to its true heading. The filter assumes zero: see `turn_frame`.
     """
 
     values: dict[str, float]
@@ -56,14 +57,14 @@ class ErrorModel:
 
 
 def fit(log, interval=1.0):
-    """`ErrorModel` of a log with truth.
+    """Fit the `ErrorModel` of a log with truth.
 
-    Sensor: `sigma_range` (about zero; where there are ranges), `sigma_bearing`, `landmark_extent`,
-    `mount_yaw`, and `outlier`: the share beyond 5 robust standard deviations of their range bin, or
-    of no landmark by the truth. Odometry, in intervals of about `interval` seconds: `err_tran`,
-    `err_rot`, `err_drift`, `gain_tran`, `gain_rot`, `bias_drift`, those of turns only if there are
-    some; the floors and the mounting's x and y stay as the log declares them. Raises `ValueError`
-    naming what the log lacks.
+    Sensor: `sigma_range` (about zero, if there are ranges), `sigma_bearing`, `landmark_extent`,
+    `mount_yaw`, and `outlier`: the share of measurements beyond 5 robust standard deviations of
+    their range bin, or of no landmark by the truth. Odometry, in intervals of about `interval`
+    seconds: `err_tran`, `err_rot`, `err_drift`, `gain_tran`, `gain_rot` and `bias_drift`; those of
+    turns only if there are turns. Floors and the mounting's x and y stay as declared by the log.
+    Raises `ValueError` naming what the log lacks.
     """
     if not 0 < interval < np.inf:
         raise ValueError(f"interval: {interval!r} s; must be above 0")
@@ -79,7 +80,7 @@ def fit(log, interval=1.0):
 
 
 def turn_frame(log, yaw):
-    """The log with the robot's frame turned by `yaw`: by `drive_yaw`, it drives along its x."""
+    """Turn the robot's frame in a log by `yaw` [rad]: by `drive_yaw`, it then drives along x."""
     (x, y, heading), c, s = log.mounting, np.cos(yaw), np.sin(yaw)
     turn, truth = np.array([0, 0, yaw]), log.truth
     if truth is not None and truth.pose is not None:
@@ -89,14 +90,14 @@ def turn_frame(log, yaw):
 
 
 def _fit_sensor(log):
-    """Values, standard errors, counts and bins of the measurements' residuals."""
+    """Fit the measurements: values, standard errors, counts, and residuals by range."""
     r, residual, clutter = _residuals(log)
     edges = np.quantile(r, np.linspace(0, 1, 1 + max(1, min(12, len(r) // 50))))
-    place = np.clip(np.searchsorted(edges, r, side="right") - 1, 0, len(edges) - 2)
+    range_bin = np.clip(np.searchsorted(edges, r, side="right") - 1, 0, len(edges) - 2)
     far = np.zeros(len(r), bool)
-    for i in np.unique(place):
-        off = np.abs(residual[place == i] - np.median(residual[place == i], axis=0))
-        far[place == i] = (off > OUTLIER * 1.4826 * np.median(off, axis=0)).any(1)
+    for i in np.unique(range_bin):
+        off = np.abs(residual[range_bin == i] - np.median(residual[range_bin == i], axis=0))
+        far[range_bin == i] = (off > OUTLIER * 1.4826 * np.median(off, axis=0)).any(1)
     bearing, off = residual[~far].T
     shape = np.column_stack([np.ones_like(bearing), r[~far] ** -2.0])  # of the bearing's variance
     start = [np.median(bearing), np.var(bearing) / 2, np.var(bearing) / 2 / shape[:, 1].mean()]
@@ -108,7 +109,7 @@ def _fit_sensor(log):
     values = dict(
         zip(("mount_yaw", "sigma_bearing", "landmark_extent"), best, strict=True), outlier=share
     )
-    values["mount_yaw"] = log.mounting[2] - best[0]  # a sensor turned to the left reads too little
+    values["mount_yaw"] = log.mounting[2] - best[0]  # turned to the left, it reads too little
     errors = dict(zip(("mount_yaw", "sigma_bearing", "landmark_extent"), error, strict=True))
     errors["outlier"] = np.sqrt(share * (1 - share) / counts["measurements"])
     if log.range is not None:
@@ -116,8 +117,8 @@ def _fit_sensor(log):
         errors["sigma_range"] = values["sigma_range"] / np.sqrt(2 * len(off))
     by_range = []
     for i, (low, high) in enumerate(pairwise(edges.tolist())):
-        inside = (place == i) & ~far
-        numbers = int(inside.sum()), int((far & (place == i)).sum())
+        inside = (range_bin == i) & ~far
+        numbers = int(inside.sum()), int((far & (range_bin == i)).sum())
         (mean_b, mean_r), (sd_b, sd_r) = residual[inside].mean(0), residual[inside].std(0)
         model = np.sqrt(best[1] ** 2 + best[2] ** 2 * np.mean(r[inside] ** -2.0))
         by_range.append(
@@ -127,7 +128,7 @@ def _fit_sensor(log):
 
 
 def _residuals(log):
-    """True ranges [n], residuals [n, 2] (bearing, range) of known landmarks, number of clutter."""
+    """Of known landmarks: true ranges [n] m and residuals [n, 2] (bearing, range); and clutter."""
     truth = log.truth
     require(log, truth.landmarks is not None and truth.landmark_id is not None, "true landmarks")
     require(log, log.bearing is not None, "bearings")
@@ -136,8 +137,8 @@ def _residuals(log):
     slots = {landmark: i for i, landmark in enumerate(truth.landmark_id.tolist())}
     slot = np.array([slots.get(i, -1) for i in identity.tolist()], int)
     pose = truth_at(truth, log.frame_time, GAP)[log.frame]
-    posed = np.isfinite(pose).all(1)
-    known = posed & (slot >= 0)
+    has_pose = np.isfinite(pose).all(1)
+    known = has_pose & (slot >= 0)
     require(log, known.sum() >= LEAST, f"at least {LEAST} measurements of known landmarks")
     x, y, heading = pose[known].T
     mx, my, yaw = log.mounting
@@ -146,6 +147,6 @@ def _residuals(log):
     r = np.maximum(np.hypot(dx, dy), 1e-6)
     bearing = wrap(log.bearing[known] - (np.arctan2(dy, dx) - heading - yaw))
     off = np.full(len(r), np.nan) if log.range is None else log.range[known] - r
-    # A measured identity of -1 may be anything; a true one is clutter.
-    clutter = 0 if truth.identity is None else int((posed & (identity < 0)).sum())
+    # A measured identity of -1 may be any landmark; a true one is clutter.
+    clutter = 0 if truth.identity is None else int((has_pose & (identity < 0)).sum())
     return r, np.column_stack([bearing, off]), clutter

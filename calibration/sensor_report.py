@@ -1,4 +1,4 @@
-"""What a calibration drive tells of the sensor: text, parameters, and the paper's fig. 6."""
+"""Report of a sensor calibration: text, parameters, and the paper's fig. 6."""
 
 from typing import NamedTuple
 
@@ -7,18 +7,18 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.odometry import ODOMETRY
-from calibration.points import Model, PointErrors, compare, coverage, identified, point_errors
+from calibration.points import Model, PointErrors, compare, coverage, identify_lines, point_errors
 from calibration.sensor import ErrorModel, fit
 from jaxslam.logs.truth import truth_at
 from jaxslam.parameters import TABLE, Params
 from jaxslam.plotting import FILTER, LANDMARK, STYLE, TRUE, ellipses, write_figure
 
-SHOWN = 250  # points drawn at most: more would cover each other
+SHOWN = 250  # largest number of points drawn: more would cover each other
 
 
 class SensorReport(NamedTuple):
     """`bearing`: noise of bearings and odometry; `errors` and `models` of the triangulated points,
-    None and empty where the log has no points."""
+    None and empty for a log without points."""
 
     bearing: ErrorModel
     errors: PointErrors | None
@@ -26,23 +26,24 @@ class SensorReport(NamedTuple):
 
 
 def calibrate_sensor(log):
-    """`SensorReport` of a drive with true poses and surveyed lines; raises `ValueError`.
+    """`SensorReport` of a drive with true poses and surveyed lines.
 
-    Lines that nobody has labelled are named by the surveyed line at their bearing.
+    Lines without identities get that of the surveyed line at their bearing. Raises `ValueError`
+    naming what the log lacks.
     """
-    unnamed = log.identity is None and (log.truth is None or log.truth.identity is None)
-    named = identified(log) if unnamed else log
-    bearing = fit(named)
+    unidentified = log.identity is None and (log.truth is None or log.truth.identity is None)
+    identified = identify_lines(log) if unidentified else log
+    bearing = fit(identified)
     if not log.has("position") or log.point is None:
         return SensorReport(bearing, None, [])
-    errors = point_errors(named, bearing.values["gain_tran"])
+    errors = point_errors(identified, bearing.values["gain_tran"])
     return SensorReport(bearing, errors, compare(errors))
 
 
 def values(report):
-    """Values of `Params` that were found and their standard errors, two dicts by name.
+    """Estimated values of `Params` and their standard errors, two dicts by name.
 
-    The mounting stays as declared: it is the camera's.
+    The mounting is left out, since it is the camera's.
     """
     found = {k: v for k, v in report.bearing.values.items() if not k.startswith("mount")}
     errors = {k: v for k, v in report.bearing.standard_errors.items() if k in found}
@@ -52,16 +53,16 @@ def values(report):
     return {k: v for k, v in found.items() if k in Params._fields}, errors
 
 
-def for_filter(report, base):
-    """`Params` for a run, from those it would have without: the motion, and how sharp points are.
+def filter_params(report, base):
+    """`Params` for the filter: `base` with the estimated motion and scale of the points' errors.
 
-    Bearings keep what `base` says: with noise as small as the lines' own, the few particles that
-    the motion happens to draw nearby would take all the weight. `position_scale` multiplies the
-    base's for the same reason.
+    `sigma_bearing` stays that of `base`: with noise as small as the lines', the few particles that
+    are drawn close to the truth would take all the weight. For the same reason the estimated
+    `position_scale` multiplies that of `base`.
     """
-    found, _ = values(report)
-    motion = {k: found[k] for k in ODOMETRY if k in found}
-    scale = base.position_scale * found.get("position_scale", 1.0)
+    estimated, _ = values(report)
+    motion = {k: estimated[k] for k in ODOMETRY if k in estimated}
+    scale = base.position_scale * estimated.get("position_scale", 1.0)
     return base._replace(**motion, position_scale=scale)
 
 
@@ -73,7 +74,7 @@ def text(report):
         error = f"{errors[name]:.2g}" if name in errors else ""
         lines.append(f"{name:<16}{value:>11.5g}{error:>12}  {TABLE[name].unit}")
     if report.models:
-        lines += ["", _counted(report.errors), ""]
+        lines += ["", _describe_errors(report.errors), ""]
         lines.append(f"{'error model of a point':<24}{'nats/point':>11}{'in 95 %':>9}  parameters")
         for model in report.models:
             shown = ", ".join(f"{k} {v:.4g}" for k, v in model.values.items())
@@ -85,18 +86,19 @@ def text(report):
     return "\n".join(lines)
 
 
-def _counted(errors):
+def _describe_errors(errors):
+    """One line on the points' errors."""
     off = np.linalg.norm(errors.point - errors.true, axis=1)
     counts = ", ".join(f"{count} {what}" for what, count in errors.counts.items())
     median, most = np.median(off), np.quantile(off, 0.95)
-    told = f"error {100 * median:.1f} cm in the median, {100 * most:.1f} cm at 95 %"
-    return f"{counts}; {told}; {100 * coverage(errors):.1f} % within their own 95 % ellipse"
+    quantiles = f"median error {100 * median:.1f} cm, 95 % quantile {100 * most:.1f} cm"
+    return f"{counts}; {quantiles}; {100 * coverage(errors):.1f} % within their 95 % ellipse"
 
 
 def draw(report, log, path):
-    """Draw the paper's fig. 6 in the world's frame: surveyed lines, 95 % ellipses, estimates.
+    """Draw the paper's fig. 6 in the world's frame: surveyed lines, points, 95 % ellipses.
 
-    Raises `ValueError` without points or when the file can't be written.
+    Raises `ValueError` without points, or if the file can't be written.
     """
     if report.errors is None:
         raise ValueError(f"{log.name}: has no triangulated points to draw")

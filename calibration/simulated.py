@@ -1,4 +1,4 @@
-"""Chessboards held before a known camera: corners for tests and for judging a calibration."""
+"""Simulate chessboards in front of a known camera, to test a calibration."""
 
 import numpy as np
 
@@ -9,12 +9,12 @@ from calibration.corners import board_points
 def simulate_boards(
     camera, boards=25, noise=0.1, seed=0, board=(6, 7), square=0.03, distance=(0.1, 0.3), tilt=0.6
 ):
-    """Pixels (list of [n, 2]) with normal noise [px], and points [n, 2] m of boards that lie fully
-    in the image's usable part.
+    """Simulate boards fully within the usable part of the image: pixels (a list of [n, 2]) with
+    normal noise [px], and points [n, 2] m on the board.
 
-    Their centres are all round and over all usable elevations, `distance` (low, high) m away; they
-    face the camera but for turns of `tilt` rad about random axes. Raises `ValueError` if the camera
-    shows too little.
+    The boards' centres are at all azimuths and usable elevations, at `distance` (low, high) m. They
+    face the camera up to turns about random axes of standard deviation `tilt` / 2 rad. Raises
+    `ValueError` if too few boards fit into the view.
     """
     rng, points = np.random.default_rng(seed), board_points(board, square)
     middle = np.column_stack([points - points.mean(0), np.zeros(len(points))])
@@ -35,7 +35,9 @@ def simulate_boards(
             pixels.append(pixel + rng.normal(0, noise, pixel.shape))
         if len(pixels) == boards:
             return pixels, points
-    raise ValueError(f"only {len(pixels)} of {boards} boards fit into the view: bring them nearer")
+    raise ValueError(
+        f"only {len(pixels)} of {boards} boards fit into the view: change their distance"
+    )
 
 
 def _facing(towards):

@@ -1,10 +1,9 @@
-"""How far the camera's axis leans from gravity, from the vertical lines of ordinary images.
+"""Tilt of the camera's axis against gravity, from the vertical lines of ordinary images.
 
-Lines that are vertical in the world all lie in planes through the camera that contain "up". So up
-is what is perpendicular to the normals of the planes of many lines: a robust least squares problem
-in two unknowns. Lines are looked for with a generous slope first, then again in views that are
-nearly upright. Images should come from several places: what leans in a room leans in every image
-of it taken from one place.
+A vertical line of the world and the camera span a plane that contains "up". So up is perpendicular
+to the normals of these planes: a robust least squares problem with two unknowns. Lines are searched
+with a large slope first, and then again in views that are nearly upright. Images should come from
+several places, since an object that leans does so in every image from one place.
 """
 
 from dataclasses import dataclass, replace
@@ -23,25 +22,26 @@ PASSES = (
     (0.03, 0.12),
     (0.02, 0.08),
     (0.01, 0.08),
-)  # tilt [rad] and slope [columns per row] allowed
-LARGEST = 0.17  # rad, of the tilt that is found
-LENGTH, GAP = 0.18, 0.03  # rad, of the lines used
+)  # largest tilt [rad] and slope [columns per row]
+LARGEST = 0.17  # rad, the largest tilt that can be found
+LENGTH, GAP = 0.18, 0.03  # rad, least length and largest gap of a line
 CONTRAST, SIGNIFICANCE = 1.2, 5.0  # grey levels per column; times the noise
 LEAST_LINES = 12
 LEAST_PER_IMAGE = 5  # lines, for an estimate from one image alone
-BLOCK, FLOOR = 7, 0.1  # rows whose peaks go together; columns, error of their mean at best
-GRID = 41  # trial tilts each way
-SPREAD = 0.004  # rad: how far from its plane up may be for a line that is vertical, at the start
-ONE_SIDED = 0.05  # spread of the lines' azimuths [rad] that is too little
+BLOCK, FLOOR = 7, 0.1  # rows with correlated errors; columns, least error of a line's mean
+GRID = 41  # trial tilts along each axis
+SPREAD = 0.004  # rad, initial standard deviation of a line's lean
+ONE_SIDED = 0.05  # spread of the lines' azimuths [rad] below which the tilt is undetermined
 BIWEIGHT = 4.685  # robust standard deviations
 
 
 @dataclass(frozen=True, eq=False)
 class Tilt:
-    """`roll` and `pitch` [rad] of the camera as a `Camera` takes them, `covariance` [2, 2] of them.
+    """`roll` and `pitch` [rad] of the camera, as in `Camera`, and their `covariance` [2, 2].
 
     `lines` used of `candidates` in `images` images; `per_image` (name, roll, pitch, lines) of those
-    with enough of their own; `scatter` [rad] of a line about it; `skipped` images by reason.
+    with enough lines; `scatter` [rad]: robust standard deviation of the lines about the vertical;
+    `skipped` images by reason.
     """
 
     roll: float
@@ -63,12 +63,13 @@ class Normals(NamedTuple):
     image: np.ndarray
 
 
-def tilt(images, camera, progress=None):
-    """`Tilt` of a camera from images: an `Images` or a list of (name, image or `ValueError`).
+def find_tilt(images, camera, progress=None):
+    """Find the `Tilt` of a camera from `Images` or a list of (name, image or `ValueError`).
 
-    Raises `ValueError` when there are too few vertical lines, all on one side, or far off.
+    `progress(done, total)` in images, over all passes. Raises `ValueError` if there are too few
+    vertical lines, all are in one direction, or the tilt is too large.
     """
-    total, given = len(PASSES) * len(images), camera
+    total, nominal = len(PASSES) * len(images), camera
     for step, (most, slope) in enumerate(PASSES):
         before = step * len(images)
 
@@ -76,11 +77,11 @@ def tilt(images, camera, progress=None):
             if progress:
                 progress(before + done, total)
 
-        found, names, skipped = _look(images, camera, slope, report)
-        lines = _joined(found, skipped)
-        up, weight = _up(lines, most)
-        looked, camera = camera, camera_with_up(camera, up)
-    _check_change(given, camera)
+        normals, names, skipped = _find_lines(images, camera, slope, report)
+        lines = _join(normals, skipped)
+        up, weight = _fit_up(lines, most)
+        previous, camera = camera, camera_with_up(camera, up)
+    _check_change(nominal, camera)
     kept = weight > 0
     residual = lines.normal[kept] @ up
     return Tilt(
@@ -89,51 +90,52 @@ def tilt(images, camera, progress=None):
         covariance=_covariance(lines, up, weight),
         lines=int(kept.sum()),
         candidates=len(weight),
-        images=len(found),
+        images=len(normals),
         scatter=float(1.4826 * np.median(np.abs(residual))),
-        per_image=_per_image(lines, weight, looked, names),
+        per_image=_per_image(lines, weight, previous, names),
         skipped=skipped,
     )
 
 
-def camera_with_tilt(camera, found):
+def camera_with_tilt(camera, tilt):
     """The camera with the roll and pitch of a `Tilt`."""
-    return replace(camera, roll=found.roll, pitch=found.pitch)
+    return replace(camera, roll=tilt.roll, pitch=tilt.pitch)
 
 
-def describe(found):
-    """Two lines for whoever turns the screws of the mount."""
-    roll_error, pitch_error = np.degrees(np.sqrt(np.diag(found.covariance)))
-    front = "raise the front" if found.pitch > 0 else "lower the front"
-    left = "lower the left" if found.roll > 0 else "raise the left"
+def describe(tilt):
+    """Instructions to level the mount, in two lines."""
+    roll_error, pitch_error = np.degrees(np.sqrt(np.diag(tilt.covariance)))
+    front = "raise the front" if tilt.pitch > 0 else "lower the front"
+    left = "lower the left" if tilt.roll > 0 else "raise the left"
     return "\n".join(
         f"{name} {angle:+.2f} +- {error:.2f} deg: {what} by {abs(angle):.2f} deg"
         for name, angle, error, what in (
-            ("pitch", degrees(found.pitch), pitch_error, front),
-            ("roll", degrees(found.roll), roll_error, left),
+            ("pitch", degrees(tilt.pitch), pitch_error, front),
+            ("roll", degrees(tilt.roll), roll_error, left),
         )
     )
 
 
 def camera_with_up(camera, up):
-    """The camera turned so that what it takes for the direction `up` [3] points up; yaw is kept."""
+    """The camera turned so that the direction `up` [3] becomes vertical; yaw is kept."""
     x, y, z = tilt_matrix(camera.roll, camera.pitch).T @ (up / np.linalg.norm(up))
     return replace(camera, roll=float(np.arctan2(y, z)), pitch=float(-np.arcsin(x)))
 
 
-def _check_change(given, found):
-    # the last row of a matrix is up, in the model's frame
-    change = np.arccos(np.clip(given.matrix[2] @ found.matrix[2], -1, 1))
+def _check_change(nominal, camera):
+    """Raise `ValueError` if the tilt between two cameras is too large to be found reliably."""
+    # The last row of `Camera.matrix` is "up" in the model's frame.
+    change = np.arccos(np.clip(nominal.matrix[2] @ camera.matrix[2], -1, 1))
     if change > LARGEST:
         raise ValueError(
-            f"tilt: {degrees(change):.0f} deg from the camera file's own; at most "
+            f"tilt: {degrees(change):.0f} deg from that of the camera file; at most "
             f"{degrees(LARGEST):.0f} can be found: check its calibration, mirror and lens"
         )
 
 
-def _look(images, camera, slope, report):
-    """`Normals` of each usable image, all names, and the skipped images' reasons with counts."""
-    found, names, skipped, first = [], [], {}, {}
+def _find_lines(images, camera, slope, report):
+    """`Normals` of each usable image, names of all, and counts of skipped images by reason."""
+    normals, names, skipped, first = [], [], {}, {}
     for index, (name, image) in enumerate(images):
         names.append(name)
         try:
@@ -141,20 +143,19 @@ def _look(images, camera, slope, report):
                 raise image
             check_size(image, camera, name)
         except ValueError as error:
-            reason = str(error).split(": ", 1)[-1]  # without the path: alike ones are counted
+            reason = str(error).split(": ", 1)[-1]  # without the path, to count equal reasons
             first.setdefault(reason, name)
             skipped[reason] = skipped.get(reason, 0) + 1
         else:
-            found.append(_normals(image, camera, slope, index))
+            normals.append(_normals(image, camera, slope, index))
         report(index + 1)
-    return found, names, {f"{why} (first: {first[why]})": n for why, n in skipped.items()}
+    return normals, names, {f"{why} (first: {first[why]})": n for why, n in skipped.items()}
 
 
 def _normals(image, camera, slope, index):
     """`Normals` of one image's nearly vertical lines."""
     view = panorama(camera)
-    spacing = (view.elevation[0] - view.elevation[-1]) / (len(view.elevation) - 1)
-    length, gap = (max(2, round(angle / spacing)) for angle in (LENGTH, GAP))
+    length, gap = (max(2, round(angle / view.row_height)) for angle in (LENGTH, GAP))
     edges = find_edges(unwrap(image, view), view.valid, CONTRAST, SIGNIFICANCE, length, gap, slope)
     n = int(edges.segment.max(initial=-1)) + 1
     ray = directions(view.bearing(edges.column - PAD), view.elevation[edges.row])
@@ -163,33 +164,34 @@ def _normals(image, camera, slope, index):
     ).reshape(n, 3, 3)
     value, vector = np.linalg.eigh(moment)
     count = np.bincount(edges.segment, minlength=n)
-    # A normal turns about the line's middle by its points' scatter, of rows in blocks, over their
-    # lever.
+    # A normal turns about the line's middle by the scatter of its points, in blocks of rows, over
+    # their lever.
     variance = BLOCK * value[:, 0] / np.maximum(count, 1) + (FLOOR * view.step) ** 2
     sigma = np.sqrt(variance / np.maximum(value[:, 1], 1e-12))
     middle = np.bincount(edges.segment, edges.column, n) / count
-    once = (middle >= PAD - 0.5) & (middle < PAD + len(view.azimuth) - 0.5)
-    return Normals(vector[once, :, 0], sigma[once], np.full(int(once.sum()), index))
+    inside = (middle >= PAD - 0.5) & (middle < PAD + len(view.azimuth) - 0.5)
+    return Normals(vector[inside, :, 0], sigma[inside], np.full(int(inside.sum()), index))
 
 
-def _joined(found, skipped):
-    lines = sum(len(normals.sigma) for normals in found)
+def _join(images, skipped):
+    """Concatenate the `Normals` of images. Raises `ValueError` for too few lines."""
+    lines = sum(len(normals.sigma) for normals in images)
     if lines < LEAST_LINES:
         reasons = "".join(f"; {count} skipped: {reason}" for reason, count in skipped.items())
         raise ValueError(
-            f"tilt: {lines} nearly vertical lines in {len(found)} images; at least {LEAST_LINES} "
+            f"tilt: {lines} nearly vertical lines in {len(images)} images; at least {LEAST_LINES} "
             f"are needed, of images that are bright and sharp{reasons}"
         )
-    return Normals(*(np.concatenate(part) for part in zip(*found, strict=True)))
+    return Normals(*(np.concatenate(part) for part in zip(*images, strict=True)))
 
 
-def _up(lines, most):
-    """Up [3] (z = 1) within `most` [rad] of z, and the lines' weights [n]: 0 for what leans."""
+def _fit_up(lines, most):
+    """Fit up [3] (z = 1) within `most` [rad] of z; returns it, and weights [n], 0 for outliers."""
     trial = np.linspace(-most, most, GRID)
     x, y = (part.ravel() for part in np.meshgrid(trial, trial))
     spread = np.hypot(lines.sigma, SPREAD)
-    away = np.abs(lines.normal @ np.stack([x, y, np.ones_like(x)])) / spread[:, None]
-    best = np.argmin(np.minimum(away**2, 9.0).sum(axis=0))
+    misfit = np.abs(lines.normal @ np.stack([x, y, np.ones_like(x)])) / spread[:, None]
+    best = np.argmin(np.minimum(misfit**2, 9.0).sum(axis=0))
     up = np.array([x[best], y[best], 1.0])
     for _ in range(20):
         residual = lines.normal @ up
@@ -204,7 +206,7 @@ def _up(lines, most):
 
 
 def _covariance(lines, up, weight):
-    """Covariance [2, 2] of (roll, pitch), from how the lines scatter (sandwich)."""
+    """Covariance [2, 2] of (roll, pitch), from the scatter of the lines (sandwich estimator)."""
     # d roll = -d(up_y), d pitch = d(up_x) near level, so (roll, pitch) has rows (n_y, n_x).
     design = lines.normal[:, [1, 0]] * [1.0, -1.0]
     bread = np.linalg.inv((design * weight[:, None]).T @ design)
@@ -213,14 +215,14 @@ def _covariance(lines, up, weight):
 
 
 def _per_image(lines, weight, camera, names):
-    """(name, roll, pitch, lines) of the images with enough lines of their own."""
+    """(name, roll, pitch, number of lines) of the images with enough lines."""
     rows = []
     for index, name in enumerate(names):
-        mine = (lines.image == index) & (weight > 0)
-        if mine.sum() < LEAST_PER_IMAGE:
+        used = (lines.image == index) & (weight > 0)
+        if used.sum() < LEAST_PER_IMAGE:
             continue
-        normal = lines.normal[mine] * np.sqrt(weight[mine])[:, None]
+        normal = lines.normal[used] * np.sqrt(weight[used])[:, None]
         xy = np.linalg.lstsq(normal[:, :2], -normal[:, 2], rcond=None)[0]
-        one = camera_with_up(camera, np.array([*xy, 1.0]))
-        rows.append((name, one.roll, one.pitch, int(mine.sum())))
+        level = camera_with_up(camera, np.array([*xy, 1.0]))
+        rows.append((name, level.roll, level.pitch, int(used.sum())))
     return rows

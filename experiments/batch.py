@@ -22,9 +22,9 @@ import jax
 import numpy as np
 
 from calibration.odometry import fit_odometry
-from jaxslam import default_params, load_log, load_params
+from jaxslam import config_for, default_params, load_log, load_params
 from jaxslam.filter.frames import frames_from_log
-from jaxslam.logs.readers import read_mrclam
+from jaxslam.logs.readers.mrclam import read_mrclam
 from jaxslam.logs.truth import truth_at, wrap
 from jaxslam.models import sensors
 from jaxslam.models.motion import model
@@ -72,7 +72,7 @@ def solve(log, params, start=None, rounds=30):
     from the starting path meet.
     """
     begin = time.perf_counter()
-    data = frames_from_log(log, "bearing", None, params, True)
+    data = frames_from_log(log, config_for(log, "bearing", "known"), params)
     frame, slot = np.nonzero(data.measurements.valid)
     who, bearing = data.measurements.identity[frame, slot], data.measurements.value[frame, slot, 0]
     pose = true_start(log, data) if start is None else np.array(start, float)

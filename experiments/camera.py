@@ -19,7 +19,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from calibration.camera import calibrate_camera, calibrate_corners, held_out
+from calibration.camera import calibrate_camera, calibrate_corners, cross_validate
 from calibration.coverage import azimuth_error
 from calibration.simulated import simulate_boards
 from jaxslam.simulation.room.render import double_mirror_camera
@@ -60,7 +60,7 @@ def real_rows(quick):
 
 def row(name, model, found, seconds, simple=False):
     key = found.order or model
-    left = held_out(found.corners, {key: found.solution}, model, found.order, simple)[key]
+    left = cross_validate(found.corners, {key: found.solution}, model, found.order, simple)[key]
     label = f"{model} {found.order or ''}".strip() + ", no decentring" * simple
     counts = f"{len(found.names)} of {len(found.names) + len(found.rejected)}"
     corners = f"{len(left)} ({found.again} / {len(found.outliers)})"

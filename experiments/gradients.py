@@ -22,6 +22,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import score_estimators
 
 from jaxslam.config import Config
 from jaxslam.learning import likelihood
@@ -156,7 +157,7 @@ def seeds(data, discount, keys, config, estimator):
     params = jax.tree.map(jnp.asarray, PARAMS)
 
     def one(key):
-        found = likelihood.score_and_value(params, data, key, config, NAMES, estimator, discount)
+        found = score_estimators.score(params, data, key, config, NAMES, estimator, discount)
         return found.total, found.log_likelihood
 
     return jax.lax.map(one, keys)

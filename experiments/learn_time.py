@@ -121,7 +121,7 @@ def searched(value, start):
 def baseline_seconds(log, params):
     """CPU seconds of the baseline's likelihood of the whole log, from its first `PART` frames."""
     log = compare.select_frames(log, np.arange(PART))
-    data = frames_from_log(log, CONFIG.sensor, CONFIG.measurements, params, True)
+    data = frames_from_log(log, CONFIG, params)
     rng, count = np.random.default_rng(0), CONFIG.particles
     draws = rng.normal(size=(3, count)), rng.normal(size=(PART, 3, count)), rng.uniform(size=PART)
     begin = time.process_time()

@@ -20,10 +20,10 @@ from line_truth import named
 
 from jaxslam.logs.truth import wrap
 from jaxslam.simulation.room.furniture import furnish
-from jaxslam.simulation.room.render import PRESETS, double_mirror_camera, frames
+from jaxslam.simulation.room.render import PRESETS, double_mirror_camera, render_frames
 from jaxslam.simulation.room.trajectory import stop_and_go
 from jaxslam.vision.lines import extract_lines
-from jaxslam.vision.matching import MatchSettings, match
+from jaxslam.vision.matching import match
 
 RESULTS = Path(__file__).parent / "results"
 SEEDS = (111, 112, 113, 114)
@@ -38,7 +38,7 @@ def lines_row(preset):
     for seed in SEEDS:
         world, drive = furnish(seed), stop_and_go("loop", seed, length=20.0)
         drive = drive._replace(pose=drive.pose[::EVERY], command=drive.command[::EVERY])
-        for image, pose, _ in frames(world, camera, drive, PRESETS[preset], seed):
+        for image, pose, _ in render_frames(world, camera, drive, PRESETS[preset], seed):
             begin = time.process_time()
             lines = extract_lines(image, camera)
             seconds.append(time.process_time() - begin)
@@ -58,17 +58,17 @@ def lines_row(preset):
 
 def match_row(step, colour):
     """Precision and recall of matches between neighbouring frames of `normal` light."""
-    camera, settings = double_mirror_camera(), MatchSettings(use_colour=colour)
+    camera = double_mirror_camera()
     right = made = possible = met = 0
     for seed in SEEDS:
         world, drive = furnish(seed), stop_and_go("loop", seed, step=step, length=5.0)
         before = None
-        for image, pose, command in frames(world, camera, drive, PRESETS["normal"], seed):
+        for image, pose, command in render_frames(world, camera, drive, PRESETS["normal"], seed):
             lines = extract_lines(image, camera)
             identity, error, _, _ = named(lines.bearing, world, pose)
             identity = np.where(np.abs(error) < SAME, identity, -1)  # surely that edge
             if before is not None:
-                pairs = match(before[0], lines, (command[0], 0.0, command[1]), settings)
+                pairs = match(before[0], lines, (command[0], 0.0, command[1]), colour)
                 pairs = pairs[before[1][pairs[:, 0]] >= 0]
                 to = world.edges.point[before[1][pairs[:, 0]]] - pose[:2]
                 there = np.arctan2(to[:, 1], to[:, 0]) - pose[2]

@@ -21,11 +21,11 @@ import numpy as np
 import worlds
 
 from jaxslam import config_for, default_params, load_log, run
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.clock_offset import shift_frames
 from jaxslam.logs.truth import wrap
 from jaxslam.models.motion import model
 from jaxslam.results.metrics import compute_errors, landmark_gate
-from jaxslam.runs.run import frames_of
 
 RESULTS = Path(__file__).parent / "results"
 WITHIN = 1.0  # s between two looks at a landmark
@@ -49,7 +49,7 @@ def logs():
 def followed(log, params):
     """Of every bearing whose landmark was seen just before: how far it is from where the odometry
     put it [rad], the turn since [rad], and whether nothing else seen just before is nearer."""
-    data = frames_of(log, config_for(log, "bearing"), params)
+    data = frames_from_log(log, config_for(log, "bearing"), params)
     who = np.append(log.identity, -1)[data.row]
     heading = np.cumsum(model(jax.tree.map(np.asarray, data.odometry), params).turn)
     time, bearing = data.time / 1e9, data.measurements.value[..., 0]

@@ -94,7 +94,7 @@ def simulated(given, seed):
         params = params._replace(density_new=default_params().density_new)
     return (
         log,
-        frames_from_log(log, given["sensor"], MOST, params, given["association"] == "known"),
+        frames_from_log(log, config_of(given, "prior"), params),
         params,
     )
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibration.tilt import camera_with_tilt, tilt
+from calibration.tilt import camera_with_tilt, find_tilt
 from jaxslam.vision.camera_files import load_camera
 from jaxslam.vision.images import read_image
 from jaxslam.vision.lines import extract_lines, halves
@@ -47,7 +47,7 @@ def main():
         images = [(path.name, read_image(path)) for path in paths]
         # The office's calibration is of the picture without 300 columns left and 320 right.
         images = [(n, i if i.shape[1] == camera.width else i[:, 300:-320]) for n, i in images]
-        found = tilt(images, camera)
+        found = find_tilt(images, camera)
         level = camera_with_tilt(camera, found)
         before, after, count = [], [], 0
         for file, image in images:

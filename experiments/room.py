@@ -23,19 +23,18 @@ import numpy as np
 from line_truth import CONTRAST, TALL, identified, named
 
 from calibration import sensor_report
-from calibration.points import coverage, point_errors, with_model
+from calibration.points import apply_model, coverage, point_errors
 from jaxslam import config_for, default_params, run
 from jaxslam.logs.truth import truth_at
 from jaxslam.results.metrics import association_accuracy, ate, pair_by_distance
 from jaxslam.simulation.room.furniture import furnish
 from jaxslam.simulation.room.geometry import visible_edges
-from jaxslam.simulation.room.render import double_mirror_camera, nominal, render_room
+from jaxslam.simulation.room.render import double_mirror_camera, nominal_camera, render_room
 from jaxslam.vision.camera_files import load_camera
 from jaxslam.vision.extract import extract
 from jaxslam.vision.images import read_image
 from jaxslam.vision.lines import LineSettings, extract_lines
 from jaxslam.vision.log_triangulation import PointSettings
-from jaxslam.vision.matching import MatchSettings
 from jaxslam.vision.overlay import draw_lines, draw_on_image
 from jaxslam.vision.panorama import panorama, unwrap
 
@@ -274,8 +273,8 @@ def draw_lines_found(place, camera, path):
 
 def ablated(camera):
     """Name -> camera and settings of the extraction, one part left out each."""
-    flat = nominal(camera)
-    blind = PointSettings(matching=MatchSettings(use_colour=False))
+    flat = nominal_camera(camera)
+    blind = PointSettings(use_colour=False)
     return {
         "all parts": (camera, {}),
         "calibration off": (replace(flat, roll=camera.roll, pitch=camera.pitch), {}),
@@ -334,7 +333,9 @@ def models_in_the_filter(report, log, seed, particles):
     lines = ["| error model of a point | nats per held-out point | in 95 % | path filtered [m] "
              "| landmarks [m] | mapped | spurious |", "|---" * 7 + "|"]  # fmt: skip
     for model in report.models:
-        result = estimated(with_model(model, log), "position hidden", particles, seed, refine=False)
+        result = estimated(
+            apply_model(model, log), "position hidden", particles, seed, refine=False
+        )
         got = score(result, seed, log)
         told = f"{model.held_out:.2f} | {100 * model.coverage:.0f} %"
         cells = f"{got['path_filtered_m']:.3f} | {got['landmarks_filtered_m']:.3f}"

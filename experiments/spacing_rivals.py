@@ -23,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
+from jaxslam import config_for
 from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.odometry import moments
 
@@ -80,7 +81,8 @@ class Predicted(NamedTuple):
 
 def run(log, params, rule):
     """`Estimate` of a whole log; `rule`: "nearest", "joint" or "known"."""
-    data = frames_from_log(log, "bearing", params=params, known=rule == "known")
+    association = "known" if rule == "known" else "maximum_likelihood"
+    data = frames_from_log(log, config_for(log, "bearing", association, descriptors=0), params)
     z, valid = np.asarray(data.measurements.value)[:, :, 0], np.asarray(data.measurements.valid)
     moves, move_covs = moments(data.odometry, params)
     moves[:, :2] *= params.gain_tran

@@ -74,9 +74,7 @@ def steps(log, rate, config, params):
         time = np.union1d(time, ticks.astype(np.int64))
     frame = np.searchsorted(time, log.frame_time)[log.frame]
     more = dataclasses.replace(log, frame_time=time, frame=frame, truth=None)
-    data = frames_from_log(
-        more, config.sensor, config.measurements, params, config.association == "known"
-    )
+    data = frames_from_log(more, config, params)
     active = np.isin(time, log.frame_time)
     return data.odometry, data.measurements._replace(active=active)
 

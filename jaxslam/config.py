@@ -1,37 +1,54 @@
-"""What a run is told: `Config` (static, decides shapes and branches) and `Params` (numbers).
+"""`Config`: the static settings of the filter, which decide shapes and branches.
 
-A value that changes a shape or a branch belongs to `Config`; one that changes a number, and could
-be learnt, to `Params`.
+A value that changes a shape or a branch belongs here; a number, which could be learned, to
+`parameters.Params`.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
-SENSORS = ("position", "range_bearing", "bearing")
+SENSORS = ("range_bearing", "position", "bearing")  # a run takes the first that the log has
 ASSOCIATIONS = ("maximum_likelihood", "known", "sampled")
 PROPOSALS = ("prior", "informed")
-REJUVENATE = 3.0  # m
-FORMER_FIELDS = {"even": "uniform_association_prior"}  # names of version 0.1, in files
+REJUVENATE = 3.0  # m, default for bearings with unknown association
+FORMER_FIELDS = {"even": "uniform_association_prior"}  # names of version 0.1, still read from files
 
 
 @dataclass(frozen=True)
 class Config:
     """Static settings of the filter; one compilation per distinct `Config`.
 
-    `proposal`: poses are drawn from the motion alone (`prior`, FastSLAM 1.0) or from motion times
-    measurements (`informed`, 2.0). `association`: see `association`.
-    `resample_threshold` t: resample when ESS < t * particles (0: never, 1 or more: every frame).
-    `exclusive`: two measurements of one frame never share a landmark. `clutter`: a measurement may
-    come from nothing. `forgetting`: landmarks carry an existence log-odds and are freed below zero
-    (None: on, unless identities are known). `uniform_association_prior`: of n landmarks in view each is as likely
-    beforehand to be the one measured, so that a match counts 1 / n; without it a landmark held
-    twice would be twice as likely (`sampled` only). `block`: particles worked on at once, so that
-    temporaries stay in cache; `lazy`: landmarks are copied to a particle's descendants when next
-    looked at, with at most `chains` ancestries to keep; `devices`: how many share the particles,
-    evenly. None of these four makes a difference to the result. `rejuvenate`: metres of driving
-    after which a run's particles are redrawn from their refined past (`rejuvenation`; 0: never;
-    None: 3 for bearings whose identities are hidden, else never). `descriptors`: coordinates of a
-    measurement's looks that help to associate (`looks`; 0: none).
+    Model and sizes:
+
+    - `sensor`: one of `SENSORS`.
+    - `association`: `known` believes the log's identities; `maximum_likelihood` and `sampled` find
+      out which landmark was measured (`filter/association.py`).
+    - `proposal`: poses are drawn from odometry (`prior`, FastSLAM 1.0) or from odometry and
+      measurements (`informed`, 2.0).
+    - `particles` N, `landmarks` M (slots of the map), `measurements` K (per frame, at most).
+    - `resample_threshold` t: resample if ESS < t * N (0: never, 1 or more: every frame).
+    - `rejuvenate`: metres of driving after which all particles are redrawn from the refined
+      posterior (0: never; None: 3 for bearings with unknown association, else never).
+    - `descriptors`: coordinates of appearance used for association (0: none).
+
+    Association rules:
+
+    - `exclusive`: two measurements of one frame never match the same landmark.
+    - `clutter`: a measurement may be of nothing.
+    - `forgetting`: landmarks carry an existence log-odds and are dropped below zero (None: on,
+      unless association is known).
+    - `uniform_association_prior`: of n landmarks in view each is as likely beforehand to be the one
+      measured, so a match counts 1 / n. Without it, a landmark that is twice in the map is twice as
+      likely. For `sampled` only.
+
+    Performance, without effect on the result:
+
+    - `block`: particles updated together, so that temporaries stay in cache.
+    - `lazy`: resampling does not copy landmarks until they are next used.
+    - `chains`: ancestries that `lazy` keeps, at most.
+    - `devices`: how many share the particles, evenly.
 
     Raises `ValueError` for a value that is not allowed.
     """
@@ -54,67 +71,69 @@ class Config:
     rejuvenate: float | None = None
     descriptors: int = 0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
+        alone = self.sensor == "bearing" and self.association == "maximum_likelihood"
+        if self.rejuvenate is None:
+            object.__setattr__(self, "rejuvenate", REJUVENATE if alone else 0.0)
+        if self.forgetting is None:
+            object.__setattr__(self, "forgetting", self.association != "known")
         for name, allowed in (
-            ("sensor", SENSORS),
-            ("association", ASSOCIATIONS),
-            ("proposal", PROPOSALS),
-        ):
+            ("sensor", SENSORS), ("association", ASSOCIATIONS), ("proposal", PROPOSALS)
+        ):  # fmt: skip
+            self._require(name, getattr(self, name) in allowed, f"one of {', '.join(allowed)}")
+        sizes = ("particles", "landmarks", "measurements", "block", "chains", "devices")
+        for name, least in (*((size, 1) for size in sizes), ("descriptors", 0)):
+            whole = self._is_whole(name, least)
+            self._require(name, whole, f"a whole number of at least {least}")
+        for name, unit in (("resample_threshold", ""), ("rejuvenate", " of metres")):
             value = getattr(self, name)
-            if value not in allowed:
-                raise ValueError(f"Config.{name}: {value!r} is not one of {', '.join(allowed)}")
-        for name in ("particles", "landmarks", "measurements", "block", "chains", "devices"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"Config.{name}: {value!r} is not a whole number of at least 1")
-        looks = self.descriptors
-        if isinstance(looks, bool) or not isinstance(looks, int) or looks < 0:
-            raise ValueError(f"Config.descriptors: {looks!r} is not a whole number of at least 0")
-        if looks and self.association == "known":
-            raise ValueError("Config.descriptors: identities are known, so looks decide nothing")
+            number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            self._require(name, number and 0 <= value < math.inf, f"a number{unit} >= 0")
+        for name in ("exclusive", "clutter", "forgetting", "uniform_association_prior", "lazy"):
+            self._require(name, isinstance(getattr(self, name), bool), "true or false")
+        self._check_combinations()
+
+    def _require(self, name, good, allowed):
+        if not good:
+            raise ValueError(f"Config.{name}: {getattr(self, name)!r} is not {allowed}")
+
+    def _is_whole(self, name, least):
+        value = getattr(self, name)
+        return isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+    def _check_combinations(self):
+        if self.descriptors and self.association == "known":
+            rule = "identities are known, so appearance decides nothing"
+            raise ValueError(f"Config.descriptors: {rule}")
         if self.particles % self.devices:
             even = self.particles // self.devices * self.devices
             raise ValueError(
                 f"Config.devices: {self.particles} particles are not shared evenly by "
                 f"{self.devices}; {even or self.devices} or {even + self.devices} are"
             )
-        threshold = self.resample_threshold
-        if not isinstance(threshold, (int, float)) or not 0 <= threshold < math.inf:
-            raise ValueError(f"Config.resample_threshold: {threshold!r} is not a number >= 0")
-        if self.rejuvenate is None:
-            alone = self.sensor == "bearing" and self.association == "maximum_likelihood"
-            object.__setattr__(self, "rejuvenate", REJUVENATE if alone else 0.0)
-        every = self.rejuvenate
-        if (
-            isinstance(every, bool)
-            or not isinstance(every, (int, float))
-            or not 0 <= every < math.inf
-        ):
-            raise ValueError(f"Config.rejuvenate: {every!r} is not a number of metres >= 0")
-        if self.forgetting is None:
-            object.__setattr__(self, "forgetting", self.association != "known")
-        for name in ("exclusive", "clutter", "forgetting", "uniform_association_prior", "lazy"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"Config.{name}: {getattr(self, name)!r} is not true or false")
-
         if self.uniform_association_prior and self.association != "sampled":
-            raise ValueError(
-                f"Config.uniform_association_prior: is for association sampled, not {self.association}"
-            )
+            rule = f"is for association sampled, not {self.association}"
+            raise ValueError(f"Config.uniform_association_prior: {rule}")
+
+    @property
+    def even(self) -> bool:
+        """`uniform_association_prior` by its name of version 0.1."""
+        return self.uniform_association_prior
 
     @classmethod
-    def from_dict(cls, values):
-        """A `Config` of a dict as files hold it; names of version 0.1 are understood."""
+    def from_dict(cls, values: Mapping[str, Any]) -> "Config":
+        """Make a `Config` of a dict as stored in files; names of version 0.1 are read, too."""
         return cls(**{FORMER_FIELDS.get(name, name): value for name, value in values.items()})
 
     @classmethod
-    def paper(cls, particles=1000, landmarks=64, measurements=16, **changes):
-        """The paper's own rules: 2-D positions, prior proposal, best match for every measurement.
-
-        Nothing is exclusive, nothing is clutter and nothing is forgotten (paper, section III-D).
+    def paper(
+        cls, particles: int = 1000, landmarks: int = 64, measurements: int = 16, **changes: Any
+    ) -> "Config":
+        """Make the paper's `Config`: 2-D positions, prior proposal, likeliest match for each
+        measurement, without exclusion, clutter or forgetting (section III-D).
         """
-        # All of them, so that no later default changes the preset.
-        rules = dict(
+        # All rules, so that no later default changes the preset.
+        rules: dict[str, Any] = dict(
             sensor="position",
             association="maximum_likelihood",
             proposal="prior",

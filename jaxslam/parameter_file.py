@@ -1,7 +1,7 @@
-"""Parameter files: TOML, one line per parameter with its unit and meaning.
+"""Read and write parameter files: TOML, one line per parameter with its unit and meaning.
 
 `name = value  # unit, meaning`, and standard errors, where known, in a table `[standard_error]`. A
-file may hold only some of the names. What is to be learnt, and how, may be told in three tables:
+file may hold only some of the names. Three tables may say what is learned, and how:
 
     [learn]
     parameters = ["err_rot", "sigma_bearing"]
@@ -13,6 +13,7 @@ file may hold only some of the names. What is to be learnt, and how, may be told
 
 import math
 import tomllib
+from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from typing import NamedTuple
@@ -27,8 +28,8 @@ MAX_BYTES = 1 << 20
 
 
 class Learning(NamedTuple):
-    """What a file says of learning: where to start, which `names` (None: not said), `bounds` and
-    `priors` as pairs by name."""
+    """Settings of learning in a file: the start `params`, `names` to learn (None: not given),
+    `bounds` and `priors` as pairs by name."""
 
     params: Params
     names: tuple | None = None
@@ -37,9 +38,9 @@ class Learning(NamedTuple):
 
 
 def validate(params, where):
-    """`params` as floats, once each value is a number in its range.
+    """Check that each value is a number in its range; returns `Params` of floats.
 
-    `where` begins the message of the `ValueError`: a file's name, for example.
+    `where` begins the message of the `ValueError`: the name of a file, for example.
     """
     values = {name: _number(where, name, value) for name, value in params._asdict().items()}
     for name, (good, allowed) in _ranges(values).items():
@@ -49,7 +50,7 @@ def validate(params, where):
 
 
 def _ranges(values):
-    """For each bounded name: whether its value is allowed, and what is."""
+    """For each bounded name: whether its value is allowed, and the allowed range in words."""
     ranges = {row.name: _range(row, values[row.name]) for row in PARAMETERS if row.low > -math.inf}
     low, high, pi = values["view_min"], values["view_max"], math.pi + 1e-6  # float32 rounds it up
     most = values["existence_max"]
@@ -57,7 +58,7 @@ def _ranges(values):
     return ranges | {
         "view_min": (-pi <= low < high, f"from -pi to below view_max, {high:g} rad"),
         "view_max": (low < high <= pi, f"above view_min, {low:g} rad, and at most pi"),
-        # Below zero a landmark would be forgotten in the frame it was born in.
+        # Below zero a landmark would be forgotten in its first frame.
         "existence_new": (0 <= new <= most, f"from 0 to existence_max, {most:g}"),
         "existence_confirm": (confirm <= most, f"at most existence_max, {most:g}"),
     }
@@ -74,42 +75,39 @@ def _range(row, value):
     return good, words
 
 
-def load_params(path, base):
-    """`Params` of a file; names it does not hold keep their value of `base`.
+def load_params(path: str | Path, base: Params) -> Params:
+    """Load the `Params` of a file; names not in it keep their value of `base`.
 
-    Raises `ValueError` naming file, name, what was found and what is allowed.
+    Raises `ValueError` naming file, parameter, value and what is allowed.
     """
     return _load(path, base).params
 
 
 def load_learning(path, base):
-    """`Learning` of a file: as `load_params`, with the tables that a run is not concerned with.
+    """Load the `Learning` of a file: parameters as in `load_params`, and the tables for learning.
 
     Raises `ValueError` as that does, and for a start outside its bounds.
     """
-    found = _load(path, base)
-    for name, (low, high) in found.bounds.items():
-        start = getattr(found.params, name)
+    learning = _load(path, base)
+    for name, (low, high) in learning.bounds.items():
+        start = getattr(learning.params, name)
         if not low <= start <= high:
-            told = f"{name} starts at {start:g}, outside its bounds {low:g} to {high:g}"
-            raise ValueError(f"{path}: {told}")
-    return found
+            text = f"{name} starts at {start:g}, outside its bounds {low:g} to {high:g}"
+            raise ValueError(f"{path}: {text}")
+    return learning
 
 
 def _load(path, base):
     table = _read(Path(path))
-    errors, learn = (_table(path, table, part) for part in (ERRORS, LEARN))
-    pairs = {part: _table(path, table, part) for part in PAIRS}
-    table, errors, pairs = (
-        _current(path, table),
-        _current(path, errors),
-        {part: _current(path, names) for part, names in pairs.items()},
-    )
-    for place, names in (("", table), (f"{ERRORS}.", errors)):
+    errors, learn = (_pop_table(path, table, part) for part in (ERRORS, LEARN))
+    pairs = {part: _pop_table(path, table, part) for part in PAIRS}
+    table, errors = _rename_former(path, table), _rename_former(path, errors)
+    pairs = {part: _rename_former(path, names) for part, names in pairs.items()}
+    for prefix, names in (("", table), (f"{ERRORS}.", errors)):
         for name, value in names.items():
-            _check_name(path, place, name)
-            if _number(path, place + name, value) < 0 and place:
-                raise ValueError(f"{path}: {place}{name} is {value!r}; must be 0 or more")
+            _check_name(path, prefix, name)
+            if _number(path, prefix + name, value) < 0 and prefix:
+                raise ValueError(f"{path}: {prefix}{name} is {value!r}; must be 0 or more")
     params = validate(base._replace(**table), path)
     for part, names in pairs.items():
         for name, value in names.items():
@@ -118,24 +116,24 @@ def _load(path, base):
     return Learning(params, _names(path, learn), pairs[BOUNDS], pairs[PRIOR])
 
 
-def _current(path, names):
-    """A table with names of version 0.1 replaced; `ValueError` where both stand."""
+def _rename_former(path, names):
+    """Replace names of version 0.1 in a table; `ValueError` if it has both names."""
     for former, name in FORMER_NAMES.items():
         if former in names and name in names:
             raise ValueError(f"{path}: {former} is the former name of {name}; give one of them")
     return current_names(names)
 
 
-def _table(path, table, part):
-    """The table of that name, taken out; empty where there is none."""
-    found = table.pop(part, {})
-    if not isinstance(found, dict):
-        raise ValueError(f"{path}: {part} is {found!r}; must be a table, [{part}]")
-    return found
+def _pop_table(path, table, part):
+    """Remove and return the table of that name; empty if there is none."""
+    value = table.pop(part, {})
+    if not isinstance(value, dict):
+        raise ValueError(f"{path}: {part} is {value!r}; must be a table, [{part}]")
+    return value
 
 
 def _names(path, learn):
-    """What `[learn]` names, or None."""
+    """Names listed in `[learn]`, or None."""
     for key in learn:
         if key != "parameters":
             raise ValueError(f"{path}: {LEARN}.{key} is not known; there is: parameters")
@@ -169,17 +167,24 @@ def _pair(path, part, name, value, params):
     if part == PRIOR and second <= 0:
         raise ValueError(f"{path}: {where}: standard deviation {second:g}; must be above 0")
     if part == PRIOR and first <= 0 and name in _ranges(params._asdict()):
-        raise ValueError(f"{path}: {where} is about {first:g}, which has no logarithm; above 0")
+        raise ValueError(
+            f"{path}: {where} is about {first:g}, which has no logarithm; must be above 0"
+        )
     return first, second
 
 
-def save_params(path, params, standard_errors=None, learning=None):
-    """Write `params` to a file, all or nothing; `standard_errors`: a dict by name, or None.
+def save_params(
+    path: str | Path,
+    params: Params,
+    standard_errors: Mapping[str, float] | None = None,
+    learning: Learning | None = None,
+) -> None:
+    """Write `params` to a file atomically; `standard_errors`: a dict by name, or None.
 
-    `learning`: a `Learning` whose names, bounds and priors are written too, so that the file can
-    start another fit.
+    `learning`: a `Learning` whose names, bounds and priors are written, too, so that another fit
+    can start from the file.
 
-    Raises `ValueError` when a value is out of range or the place can't be written.
+    Raises `ValueError` if a value is out of range or the file can't be written.
     """
     path = Path(path)
     values = validate(params, path)._asdict()
@@ -197,7 +202,7 @@ def save_params(path, params, standard_errors=None, learning=None):
 
 
 def _learning_lines(path, learning):
-    """The tables of a `Learning`."""
+    """Yield the tables of a `Learning`."""
     if learning.names is not None:
         names = ", ".join(f'"{name}"' for name in _names(path, {"parameters": [*learning.names]}))
         yield f"\n[{LEARN}]\nparameters = [{names}]\n"
@@ -221,19 +226,19 @@ def _read(path):
         raise ValueError(f"{path}: over {MAX_BYTES} bytes, so it is no file of parameters")
     try:
         return tomllib.loads(content.decode("utf-8"))
-    except ValueError as err:  # also what can't be decoded
+    except ValueError as err:  # also if not UTF-8
         raise ValueError(f"{path}: not TOML: {err}") from err
 
 
-def _check_name(path, place, name):
+def _check_name(path, prefix, name):
     if name not in Params._fields:
         near = get_close_matches(name, Params._fields, n=1)
         hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(Params._fields)}"
-        raise ValueError(f"{path}: {place}{name} is no parameter; {hint}")
+        raise ValueError(f"{path}: {prefix}{name} is no parameter; {hint}")
 
 
 def _number(where, name, value):
-    """A finite float of a number or a 0-d array."""
+    """Convert a number or a 0-d array to a finite float, or raise `ValueError`."""
     try:
         number = math.nan if isinstance(value, bool | str) else float(value)
     except (TypeError, ValueError):

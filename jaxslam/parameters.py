@@ -1,28 +1,29 @@
-"""The filter's numbers: `PARAMETERS`, one row each, and `Params`, their values.
+"""The parameters of the filter: `PARAMETERS` describes each in a row, `Params` holds their values.
 
-Everything that is known about a parameter stands in its row: default, unit, range, how it is
-learned and what it is called. Parameter files, learning, messages and the documentation's table
-read it from there.
+A row has default, unit, range, meaning, and how the parameter is learned. Parameter files,
+learning, messages and the documentation's table are derived from it.
 """
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from jaxslam.config import SENSORS
 
-MOTION, ALTERNATIVES = "motion", "alternatives"  # whose likelihoods depend on it, beside a sensor's
-EVERY_SENSOR = SENSORS
-COMMAND_FLOOR = 0.002  # m/sqrt(s): a commanded step errs with its length, not with time
+if TYPE_CHECKING:
+    from jaxslam.logs.log import Log
+
+MOTION, ALTERNATIVES = "motion", "alternatives"  # in `learned_by`, beside the sensors
+COMMAND_FLOOR = 0.002  # m/sqrt(s): the error of a commanded step grows with its length, not time
 
 
 class Parameter(NamedTuple):
-    """One of the filter's numbers.
+    """Description of one parameter.
 
-    `default`, with other values for some sensors in `of_sensor`. Allowed values lie between `low`
-    and `high`, which are allowed themselves unless `above_low` or `below_high` is set. Learned on
-    the scale `scale` (log, logit or linear), in units of `step`, by the likelihoods named in
-    `learned_by`: `MOTION`, `ALTERNATIVES` (new landmark or clutter), or sensors. `note`: what the
-    documentation adds to the meaning. `former`: its name in version 0.1, still read from files.
+    - `default`, with other values for some sensors in `of_sensor`.
+    - Range from `low` to `high`, both included unless `above_low` or `below_high` is set.
+    - Learned on the free scale `scale` (log, logit or linear), in units of `step`, from the
+      likelihoods in `learned_by`: `MOTION`, `ALTERNATIVES` (new landmark or clutter), or sensors.
+    - `note`: what the documentation adds to `meaning`. `former`: name in version 0.1, still read.
     """
 
     name: str
@@ -51,9 +52,9 @@ def _not_negative(name, default, unit, meaning, **rest):
 
 # Wide enough for a real robot's errors, which are correlated from frame to frame. Tuned by hand on
 # the bundled log and MRCLAM dataset 6, with their truth: nothing of these was held out. For
-# `position` the motion is as tight as when points were first made with it. A bearing's noise is the
-# sensor's own, so that refinement can use it as it is; the filter, which can't take back a wrong
-# depth, adds `extra_bearing_noise`.
+# `position` the motion is tighter: triangulation was tuned with it. A bearing's noise is the
+# sensor's own, which refinement uses as it is; the filter, which can't correct a wrong depth later,
+# adds `extra_bearing_noise`.
 PARAMETERS = (
     _not_negative(
         "err_tran", 0.02, "m/sqrt(m)", "noise along the path, per distance",
@@ -107,36 +108,36 @@ PARAMETERS = (
         learned_by=("position",), note="of positions that bring their own covariance",
     ),
     _not_negative(
-        "correlation", 0.0, "m", "path over which errors stay alike", note="0: independent errors",
+        "correlation", 0.0, "m", "path over which errors are correlated",
+        note="0: independent errors",
     ),
     _not_negative(
-        "extra_bearing_noise", 0.0, "rad", "bearing noise that the filter adds", former="caution",
-        of_sensor={"bearing": 0.06}, note="in quadrature; refinement does without",
+        "extra_bearing_noise", 0.0, "rad", "bearing noise added by the filter", former="caution",
+        of_sensor={"bearing": 0.06}, note="in quadrature; refinement does not",
     ),
     Parameter(
         "mount_x", 0.0, "m", "sensor on the robot, forward",
-        scale="linear", step=0.1, learned_by=EVERY_SENSOR, note="declared by the log",
+        scale="linear", step=0.1, learned_by=SENSORS, note="declared by the log",
     ),
     Parameter(
         "mount_y", 0.0, "m", "sensor on the robot, left",
-        scale="linear", step=0.1, learned_by=EVERY_SENSOR, note="declared by the log",
+        scale="linear", step=0.1, learned_by=SENSORS, note="declared by the log",
     ),
     Parameter(
         "mount_yaw", 0.0, "rad", "sensor on the robot, counter-clockwise",
-        scale="linear", step=0.1, learned_by=EVERY_SENSOR, note="declared by the log",
+        scale="linear", step=0.1, learned_by=SENSORS, note="declared by the log",
     ),
     Parameter(
-        "outlier", 0.01, "probability", "that a measurement comes from nothing",
+        "outlier", 0.01, "probability", "that a measurement is clutter",
         low=0.0, high=1.0, below_high=True, scale="logit", learned_by=(ALTERNATIVES,),
         of_sensor={"bearing": 3e-3}, note="uniformly over the view",
     ),
     _positive(
-        "density_new", 1e-3, "1/m^2", "landmarks to be expected", learned_by=(ALTERNATIVES,),
-        note="where none is known; well below the real density, since it also counts where all "
-        "have been found",
+        "density_new", 1e-3, "1/m^2", "density of unmapped landmarks", learned_by=(ALTERNATIVES,),
+        note="well below the real density, since it also applies where all have been mapped",
     ),
     Parameter(
-        "detection", 0.9, "probability", "that a landmark at range 0 is seen", low=0.0, high=1.0,
+        "detection", 0.9, "probability", "detection of a landmark at range 0", low=0.0, high=1.0,
         note="falls linearly to 0 at `view_range`",
     ),
     Parameter(
@@ -151,44 +152,42 @@ PARAMETERS = (
         "view_range", 10.0, "m", "largest range the sensor sees", note="declared by the log",
     ),
     _positive(
-        "inv_depth_mean", 0.4, "1/m", "inverse depth of a new landmark (bearing only)",
+        "inv_depth_mean", 0.4, "1/m", "inverse depth of a new landmark (bearings only)",
         learned_by=("bearing",), note="2.5 m away: for indoors",
     ),
     _positive(
-        "inv_depth_sd", 0.25, "1/m", "its standard deviation",
-        learned_by=("bearing",), note="two of them reach from 1.1 m to infinity",
+        "inv_depth_sd", 0.25, "1/m", "standard deviation of that inverse depth",
+        learned_by=("bearing",), note="two of them span 1.1 m to infinity",
     ),
     Parameter("existence_new", 1.0, "log-odds", "existence of a new landmark", low=0.0),
     _not_negative(
-        "existence_seen", 0.5, "log-odds per frame", "added when it is seen",
+        "existence_seen", 0.5, "log-odds per frame", "added when a landmark is measured",
         note="less than one measurement is worth, since they are not independent",
     ),
     _not_negative(
-        "existence_miss", 0.1, "factor", "weight of not seeing what was expected",
-        note="low, since landmarks hide one another",
+        "existence_miss", 0.1, "factor", "weight of a missed detection",
+        note="low, since landmarks occlude one another",
     ),
     _positive(
-        "existence_max", 20.0, "log-odds", "existence at most",
-        note="so that a landmark that has gone is forgotten",
+        "existence_max", 20.0, "log-odds", "upper limit of existence",
+        note="so that a landmark that is gone is forgotten",
     ),
-    Parameter("existence_confirm", 5.0, "log-odds", "from here on it is in the map"),
+    Parameter("existence_confirm", 5.0, "log-odds", "from here on a landmark is in the map"),
 )  # fmt: skip
 TABLE = {parameter.name: parameter for parameter in PARAMETERS}
 FORMER_NAMES = {row.former: row.name for row in PARAMETERS if row.former}
 
 
 class Params(NamedTuple):
-    """The filter's numbers, each a float or a 0-d array; `PARAMETERS` has units and meanings.
+    """Values of the parameters, floats or 0-d arrays; `PARAMETERS` has units and meanings.
 
     Motion noise grows with what was driven: variance `err_tran**2` per metre, `err_rot**2` per
     radian turned, `err_drift**2` rad^2 per metre, and the floors per second. Gains are true over
     measured odometry. The variance of a bearing is
     `sigma_bearing**2 + (landmark_extent / range)**2`: a tube or a door edge has a size. Errors of
-    one landmark's measurements stay alike over a path of `correlation`, so that standing still
-    tells nothing new (0: always independent). The filter adds `extra_bearing_noise` to the
-    bearing's standard deviation in quadrature, since its particles are few and errors are not as
-    independent as it takes them to be; refinement does without. `view_*` is what the sensor can see
-    and is declared by the log.
+    one landmark's measurements are correlated over a path of `correlation`, so that standing still
+    gives no new information (0: independent). The filter adds `extra_bearing_noise` in quadrature,
+    since its particles are few and errors less independent than it assumes; refinement does not.
     """
 
     err_tran: float
@@ -223,28 +222,29 @@ class Params(NamedTuple):
     existence_confirm: float
 
     @property
-    def growth(self):
+    def growth(self) -> float:
         """`landmark_extent` by its name of version 0.1."""
         return self.landmark_extent
 
     @property
-    def caution(self):
+    def caution(self) -> float:
         """`extra_bearing_noise` by its name of version 0.1."""
         return self.extra_bearing_noise
 
 
 def current_names(values):
-    """A dict by parameter name, with names of version 0.1 replaced by today's."""
+    """Replace names of version 0.1 in a dict by today's names."""
     return {FORMER_NAMES.get(name, name): value for name, value in values.items()}
 
 
-def learned_by(whose):
-    """Names of the parameters on which that likelihood depends, in their order."""
-    return tuple(row.name for row in PARAMETERS if whose in row.learned_by)
+def learned_by(likelihood):
+    """List the parameters on which a likelihood depends, in their order."""
+    return tuple(row.name for row in PARAMETERS if likelihood in row.learned_by)
 
 
-def default_params(sensor="range_bearing", log=None):
-    """Default `Params` of a sensor, with what the log declares: odometry, mounting, view, noise.
+def default_params(sensor: str = "range_bearing", log: "Log | None" = None) -> "Params":
+    """Make the default `Params` of a sensor, with the odometry, mounting, view and noise that a
+    log declares.
 
     Raises `ValueError` for a sensor that is not one of `SENSORS`.
     """

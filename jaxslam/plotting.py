@@ -15,7 +15,7 @@ TRUE, FILTER, RECKONING, LANDMARK, PLAN = "#222222", "#0072B2", "#E69F00", "#D55
 REFINED, ANCESTRAL = "#009E73", "#CC79A7"
 
 
-STYLE = {
+STYLE: dict = {
     "font.size": 10,
     "axes.titlesize": 11,
     "axes.titlelocation": "left",

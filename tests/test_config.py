@@ -201,5 +201,5 @@ def test_a_log_declares_mounting_view_and_noise_and_nothing_else():
 
 
 def test_default_params_of_no_sensor():
-    with pytest.raises(ValueError, match=r"^sensor: 'sonar' is not one of position, range"):
+    with pytest.raises(ValueError, match=r"^sensor: 'sonar' is not one of range_bearing, position"):
         default_params("sonar")

@@ -1,48 +1,68 @@
-"""The commands that begin at images: calibrate, extract, triangulate, and the rendered room."""
+"""Commands for images: `calibrate`, `extract`, `triangulate` and `simulate room`."""
 
 from pathlib import Path
 from typing import Literal
 
-from cyclopts import App
+from cyclopts import App, Group
 
-from jaxslam.cli.common import LogName, OutLog, Overwrite, Seed, bar, check_new, option, warn
+from jaxslam.cli.common import (
+    LogName,
+    OutLog,
+    Overwrite,
+    Seed,
+    check_new,
+    option,
+    progress_bar,
+    warn,
+)
 
-calibrate = App(name="calibrate", help="Fit a camera, its tilt, or a sensor's errors.")
+calibrate = App(name="calibrate", help="Calibrate a camera, its tilt, or a sensor's errors.")
 
-Source = option(Path, "a folder of images, one image, or a video")
-Boards = option(Path, "a folder of images of the board, or the images themselves")
-CameraFile = option(Path, "the camera: .toml, OCamCalib's .txt, or .yaml of Kalibr or OpenCV")
-Camera = option(Path, "where the camera is written, a .toml file")
-Motion = option(Path, "parameters of the robot's motion, from calibrate sensor") | None
-Overlay = option(Path, "folder, .mp4 or .avi for the images with their lines drawn in") | None
-Truth = option(Path, "folder of poses.csv, landmarks.csv and plan.csv, where known") | None
+CAMERA, FOREIGN = map(Group.create_ordered, ("Camera", "Camera files of other tools"))
+Source = option(Path, "Folder of images, one image, or a video.")
+Boards = option(Path, "Folder of images of the board, or the image files.")
+CameraFile = option(Path, "Camera file: .toml, OCamCalib's .txt, or .yaml of Kalibr or OpenCV.")
+Camera = option(Path, "Camera file to write, a .toml file.")
+Motion = option(Path, "TOML file with parameters of the motion, from calibrate sensor.") | None
+Overlay = option(Path, "Folder, .mp4 or .avi to write: the images with their lines.") | None
+Truth = option(Path, "Folder with any of poses.csv, landmarks.csv and plan.csv.") | None
 Models = Literal["polynomial", "unified"]
 Sides = Literal["up", "down"]
-LensSide = option(Sides, "where the lens points on the robot")
-LensOfFile = option(Sides, "where the lens points; not for a .toml, which says it")
-Mirror = option(bool, "the lens looks into one mirror (not for two, which turn the view back)")
-MirrorOfFile = option(bool, "it looks into one mirror; not for a .toml, which says it")
+LensSide = option(Sides, "Direction of the lens on the robot.", CAMERA)
+LensOfFile = option(
+    Sides, "Direction of the lens; ignored for .toml files, which hold it.", FOREIGN
+)
+Mirror = option(
+    bool, "The camera looks into one mirror (not for two, which restore the view).", CAMERA
+)
+MirrorOfFile = option(
+    bool, "The camera looks into one mirror; ignored for .toml files, which hold it.", FOREIGN
+)
 Drives = Literal["loop", "straight", "turn"]
 Presets = Literal["clean", "normal", "hard"]
+DRIVE = "Round the room, straight along a wall, or a turn on the spot."
+LENGTH = "Length of the path in metres (default: loop 60, straight 6), or of a turn in rad (2 pi)."
+MODEL = "Camera model: polynomial (Scaramuzza) or unified (Mei)."
+ODOMETRY = "Odometry .csv: time_s,distance_m,turn_rad or time_s,forward_m_s,yaw_rate_rad_s."
 
 
 @calibrate.command(usage="Usage: jaxslam calibrate camera [OPTIONS] IMAGES...")
 def camera(
     *images: Boards,
-    board: option(str, "inner corners (where four squares meet), as 6x7"),
-    square: option(float, "side of one square [m]"),
-    model: option(Models, "polynomial (Scaramuzza) or unified (Mei) model") = "polynomial",
+    board: option(str, "Number of inner corners (where four squares meet), e.g. 6x7."),
+    square: option(float, "Side of a square in metres."),
+    out: Camera = Path("camera.toml"),
+    report: option(Path, "Picture of the fit to write, a .png file.") = Path("camera.png"),
+    overwrite: Overwrite = False,
+    model: option(Models, MODEL, CAMERA) = "polynomial",
     mirror: Mirror = False,
     lens: LensSide = "up",
-    out: Camera = Path("camera.toml"),
-    report: option(Path, "picture of the fit, a .png") = Path("camera.png"),
-    overwrite: Overwrite = False,
 ):
     """Calibrate a mirror or fisheye camera from images of a chessboard.
 
-    Take ten or more: all round the camera, near and far, the board tilted. Prints the
-    residuals of every image, what was rejected and why, how the corners cover the
-    view, and the uncertainty of bearings in degrees.
+    Take ten or more images: all round the camera, near and far, with the board tilted.
+    Prints the residuals of every image, rejected images with reasons, the coverage of
+    the view by corners, and the uncertainty of bearings in degrees.
 
     Example: jaxslam calibrate camera boards/ --board 6x7 --square 0.03 --mirror
     """
@@ -54,21 +74,16 @@ def camera(
         raise ValueError("calibrate camera: a folder, or files, of images are needed")
     check_new(out, overwrite, "a camera", ".toml")
     check_new(report, overwrite, "a picture", ".png")
-    with bar("finding corners") as progress:
-        found = calibrate_camera(
-            list(images) if len(images) > 1 else images[0],
-            _board(board),
-            square,
-            model=model,
-            mirror=mirror,
-            lens=lens,
-            progress=progress,
-        )
-    save_camera(out, found.camera)
-    draw(found, report)
-    print(text(found))
+    with progress_bar("finding corners") as progress:
+        calibration = calibrate_camera(
+            list(images) if len(images) > 1 else images[0], _parse_board(board), square,
+            model=model, mirror=mirror, lens=lens, progress=progress,
+        )  # fmt: skip
+    save_camera(out, calibration.camera)
+    draw(calibration, report)
+    print(text(calibration))
     print(f"{out}: the camera; {report}: the fit")
-    return int(bool(found.rejected))  # a warning about the set is advice
+    return int(bool(calibration.rejected))  # warnings about the set are only advice
 
 
 @calibrate.command
@@ -77,31 +92,30 @@ def tilt(
     /,
     *,
     camera: CameraFile,
-    mirror: MirrorOfFile = False,
-    lens: LensOfFile = "up",
     out: Camera | None = None,
     overwrite: Overwrite = False,
+    mirror: MirrorOfFile = False,
+    lens: LensOfFile = "up",
 ):
-    """Find which way is up from the vertical lines of ordinary images of rooms.
+    """Find the tilt of a camera from the vertical lines in ordinary images of rooms.
 
-    Prints the roll and pitch to correct on the mount; --out writes the camera with
-    the tilt, which then compensates it.
+    Prints the roll and pitch to correct on the mount. Alternatively, --out writes a
+    camera file that compensates the tilt.
 
     Example: jaxslam calibrate tilt images/ --camera camera.toml --out level.toml
     """
-    from calibration.tilt import camera_with_tilt, describe
-    from calibration.tilt import tilt as find_tilt
+    from calibration.tilt import camera_with_tilt, describe, find_tilt
     from jaxslam.vision.camera_files import load_camera, save_camera
     from jaxslam.vision.images import Images
 
     if out:
         check_new(out, overwrite, "a camera", ".toml")
-    known = load_camera(camera, mirror, lens)
-    with bar("looking for lines") as progress:
-        found = find_tilt(Images(images), known, progress=progress)
+    nominal = load_camera(camera, mirror, lens)
+    with progress_bar("searching for lines") as progress:
+        found = find_tilt(Images(images), nominal, progress=progress)
     print(describe(found))
     if out:
-        save_camera(out, camera_with_tilt(known, found))
+        save_camera(out, camera_with_tilt(nominal, found))
         print(f"{out}: the camera with this tilt")
     for why, count in found.skipped.items():
         warn(f"images skipped, {count}: {why}")
@@ -113,17 +127,16 @@ def sensor(
     log: LogName,
     /,
     *,
-    out: option(Path, "file to write, a .toml, for --params of extract and run") = Path(
-        "params.toml"
-    ),
-    figure: option(Path, "picture of points and ellipses (the paper's fig. 6)") | None = None,
+    out: option(Path, "TOML file to write, for --params of extract and run.") = Path("params.toml"),
+    figure: option(Path, "Picture of points and ellipses (paper, fig. 6), a .png file.")
+    | None = None,
     overwrite: Overwrite = False,
 ):
-    """Find a sensor's error model from a drive whose truth is known.
+    """Fit a sensor's error model to a drive whose truth is known.
 
-    The paper's procedure: drive straight past surveyed lines, 30 stops or more, and
-    extract with --truth. Prints the noise of bearings and motion, and which model of
-    a point's error predicts best, each on the half of the drive it was not fitted on.
+    The paper's procedure: drive straight past surveyed lines, with 30 stops or more,
+    and extract with --truth. Prints the noise of bearings and motion, and compares
+    models of a point's error, by two-fold cross-validation on halves of the drive.
 
     Example: jaxslam calibrate sensor straight.npz --out params.toml --figure points.png
     """
@@ -137,17 +150,19 @@ def sensor(
     if figure:
         check_new(figure, overwrite, "a picture", ".png")
         if not drive.has("position") or drive.point is None:
-            raise ValueError(f"{log}: has no points to draw; leave --figure out, or triangulate")
-    with bar("fitting"):
+            raise ValueError(
+                f"{log}: has no points to draw; omit --figure, or run jaxslam triangulate first"
+            )
+    with progress_bar("fitting"):
         report = sensor_report.calibrate_sensor(drive)
     print(sensor_report.text(report))
     base = default_params("position" if report.models else "bearing", drive)
-    params = sensor_report.for_filter(report, base)
+    params = sensor_report.filter_params(report, base)
     errors = sensor_report.values(report)[1]
     save_params(
         out, params, {k: v for k, v in errors.items() if getattr(base, k) != getattr(params, k)}
     )
-    print(f"{out}: the motion, and the points' scale, for --params of extract and run")
+    print(f"{out}: motion and position_scale, for --params of extract and run")
     if figure:
         print(f"{sensor_report.draw(report, drive, figure)}: points, ellipses, surveyed lines")
 
@@ -157,23 +172,21 @@ def extract(
     /,
     *,
     camera: CameraFile,
-    mirror: MirrorOfFile = False,
-    lens: LensOfFile = "up",
-    odometry: option(
-        Path, ".csv of time_s,distance_m,turn_rad or time_s,forward_m_s,yaw_rate_rad_s"
-    ),
+    odometry: option(Path, ODOMETRY),
     out: OutLog,
     truth: Truth = None,
     params: Motion = None,
     overlay: Overlay = None,
     overwrite: Overwrite = False,
+    mirror: MirrorOfFile = False,
+    lens: LensOfFile = "up",
 ):
-    """Make a log of images: vertical lines, matched and triangulated, with the odometry.
+    """Make a log from images and odometry: vertical lines, matched and triangulated.
 
-    When the images were taken is read from frames.csv (image,time_s), in their folder
-    or the one above. Without it: one image before the first command and one after
-    each, a video's own rate, or names that are seconds, whichever fits first.
-    The same command again goes on where an interrupted one stopped.
+    The images' times are read from frames.csv (image,time_s), in their folder or the
+    one above. Without it, the first that fits: one image before the first command and
+    one after each, the frame rate of a video, or names that are times in seconds.
+    To resume an interrupted extraction, repeat the command.
 
     Example: jaxslam extract images/ --camera c.toml --odometry o.csv --out OUT.npz
     """
@@ -183,27 +196,27 @@ def extract(
     from jaxslam.vision.extract import extract as run_extract
 
     check_new(out, overwrite)
-    known = load_camera(camera, mirror, lens)
+    calibrated = load_camera(camera, mirror, lens)
     robot = load_params(params, default_params("position")) if params else None
     try:
-        with bar("extracting lines") as progress:
+        with progress_bar("extracting lines") as progress:
             log = run_extract(
-                images, known, odometry, out, truth=truth, params=robot, overlay=overlay,
+                images, calibrated, odometry, out, truth=truth, params=robot, overlay=overlay,
                 overwrite=overwrite, progress=progress,
             )  # fmt: skip
     except KeyboardInterrupt:
-        warn("stopped; the same command again goes on from here")
+        warn("stopped; repeat the command to resume")
         raise
-    return _account(log, out)
+    return _summarize(log, out)
 
 
 def triangulate(
     log: LogName, out: OutLog, /, *, params: Motion = None, overwrite: Overwrite = False
 ):
-    """Add points to a log of bearings: matched between frames, triangulated by odometry.
+    """Add points to a log: bearings, matched between frames and triangulated by odometry.
 
-    The paper's way on any log; jaxslam run --sensor position then uses the points.
-    What extract wrote has points already.
+    This is the paper's procedure, for any log of bearings. Logs from extract have
+    points already. Use them with jaxslam run --sensor position.
 
     Example: jaxslam triangulate lost-in-the-woods OUT.npz
     """
@@ -213,80 +226,76 @@ def triangulate(
     from jaxslam.vision.log_triangulation import triangulate_log
 
     check_new(out, overwrite)
-    with bar("triangulating") as progress:
-        given = load_log(log)
-        robot = load_params(params, default_params("position", given)) if params else None
-        found = triangulate_log(given, robot, progress=progress)
-    save_log(out, found)
-    return _account(found, out, " --sensor position", given.skipped)
+    with progress_bar("triangulating") as progress:
+        bearings = load_log(log)
+        robot = load_params(params, default_params("position", bearings)) if params else None
+        points = triangulate_log(bearings, robot, progress=progress)
+    save_log(out, points)
+    return _summarize(points, out, " --sensor position", bearings.skipped)
 
 
 def room(
-    out: option(Path, "folder to write"),
+    out: option(Path, "Folder to write."),
     /,
     *,
     seed: Seed = 0,
-    drive: option(
-        Drives, "round and round the room, straight along a wall, or turning on the spot"
-    ) = "loop",
-    step: option(float, "between two images [m]") = 0.2,
-    length: option(float, "of the path [m] (loop 60, straight 6); of a turn [rad] (a whole one)")
-    | None = None,
-    preset: option(Presets, "light, blur and noise of the images") = "normal",
+    drive: option(Drives, DRIVE) = "loop",
+    step: option(float, "Distance between two images in metres.") = 0.2,
+    length: option(float, LENGTH) | None = None,
+    preset: option(Presets, "Light, blur and noise of the images.") = "normal",
     overwrite: Overwrite = False,
 ):
-    """Render the drive of a robot through a furnished room, seen by a mirror camera.
+    """Render a robot's drive through a furnished room, seen by a mirror camera.
 
-    Writes images, the commands (how wheels slipped is in the truth only), the camera,
-    and the truth: poses, landmarks, floor plan. A loop has some 300 images.
+    Writes images, commands (without the slip of the wheels), the camera file, and the
+    truth: poses, landmarks and floor plan. A loop has about 300 images.
 
     Example: jaxslam simulate room rooms/1 --seed 1
     """
     from jaxslam.simulation.room.render import render_room
 
-    with bar("rendering") as progress:
+    with progress_bar("rendering") as progress:
         frames = render_room(
-            out,
-            seed=seed,
-            drive=drive,
-            step=step,
-            length=length,
-            preset=preset,
-            overwrite=overwrite,
-            progress=progress,
-        )
-    given = f"--camera {out / 'camera.toml'} --odometry {out / 'odometry.csv'} --truth {out}"
-    print(f"{out}: {frames} images; next: jaxslam extract {out / 'images'} {given} --out OUT.npz")
+            out, seed=seed, drive=drive, step=step, length=length, preset=preset,
+            overwrite=overwrite, progress=progress,
+        )  # fmt: skip
+    inputs = f"--camera {out / 'camera.toml'} --odometry {out / 'odometry.csv'} --truth {out}"
+    print(f"{out}: {frames} images; next: jaxslam extract {out / 'images'} {inputs} --out OUT.npz")
 
 
-def _board(text):
-    """Corners along both sides, of text like 6x7."""
+def _parse_board(text):
+    """Parse the number of corners along both sides, like 6x7."""
     sides = [int(side) if side.isdecimal() else 0 for side in text.lower().split("x")]
     if len(sides) != 2 or min(sides) < 2:
         raise ValueError(f"--board is {text!r}; must be two counts of inner corners, like 6x7")
     return tuple(sides)
 
 
-def _account(log, out, how="", told=()):
-    """Print what a log of lines holds and what was left out, but for what was `told` when the log
-    was made; the exit code."""
+def _summarize(log, out, options="", reported=()):
+    """Print the contents of a log of lines, and what was skipped; return the exit code.
+
+    `options` of `jaxslam run` for this log; `reported`: skipped reasons of the log it is made from.
+    """
     import numpy as np
 
     from jaxslam.logs.log import NOT_USED
 
     points = int(np.isfinite(log.point[:, 0]).sum())
     print(f"{out}: {log}, {points} points")
-    lost = False
+    incomplete = False
     for why, count in log.skipped.items():
         if why.startswith(NOT_USED):
             print(f"{count} {why}")
-        elif why not in told:
-            lost = True
+        elif why not in reported:
+            incomplete = True
             warn(f"{why}: {count}")
     if not len(log.frame):
-        warn("no line in any image: blurred, or is the camera's file another's?")
+        warn(
+            "no line in any image: are the images blurred, or does the camera file belong to "
+            "another camera?"
+        )
     elif not points:
-        warn("no points: only jaxslam run --sensor bearing can map this")
+        warn("no points: only jaxslam run --sensor bearing can map this log")
     else:
-        print(f"map it with: jaxslam run {out}{how}")
-    return int(lost or not points)
+        print(f"map it with: jaxslam run {out}{options}")
+    return int(incomplete or not points)

@@ -19,10 +19,10 @@ from jaxslam.cli.common import (
     Sensor,
     Start,
     at_least,
-    bar,
     check_new,
     note,
     option,
+    progress_bar,
     warn,
 )
 from jaxslam.config import ASSOCIATIONS
@@ -59,9 +59,6 @@ def learn(
     held_out_end: End = None,
     seeds: at_least("per log and step", 2) = 4,
     steps: at_least("at most") = 150,
-    surface: option(str, "draw the likelihood over two parameters, like err_rot,err_drift")
-    | None = None,
-    compare_models: option(bool, "say which sensor error model the held-out logs prefer") = False,
     seed: Seed = 0,
     out: option(Path, "the file of parameters to write") = Path("params.toml"),
     overwrite: Overwrite = False,
@@ -77,34 +74,29 @@ def learn(
     Example: jaxslam learn lost-in-the-woods --end 600 --held-out lost-in-the-woods
     --held-out-start 600 --parameters err_rot,err_drift,gain_rot --out fit/params.toml
     """
-    files = _files(out, surface, overwrite, resume)
+    files = _files(out, overwrite, resume)
     if not logs:
         raise ValueError(f"learn: which log? There is {DEMO}, for one")
-    if compare_models and not held_out:
-        raise ValueError("--compare-models needs --held-out logs to compare by")
     _check_apart(logs, (start, end), held_out, (held_out_start, held_out_end))
     _use_all_cores()
-    with bar("reading"):
+    from jaxslam.learning.data import config_for_logs
+
+    with progress_bar("reading"):
         known = association == "known"
         train = _windows(logs, start, end, window, spacing, known)
         judges = _windows(held_out, held_out_start, held_out_end, window, spacing, known)
-        config, dropped = _config(train + judges, sensor, association, particles, landmarks)
+        config, dropped = config_for_logs(train + judges, sensor, association, particles, landmarks)
         task = _task(train, config, params, parameters)
-        pair = _pair(surface, task.names)
     out.parent.mkdir(parents=True, exist_ok=True)
     fit = _run_fit(train, judges, config, task, seeds, steps, seed, files, resume)
     fit, errors, judged = _assess(fit, train, judges, seed)
     _write(fit, errors, task, files)
     found = _print_fit(fit, errors, judged, dropped, files)
-    if pair:
-        _draw_surface(train, fit, errors, pair, files["surface"], seed)
-    if compare_models:
-        found |= _models(train, judges, fit, seeds, steps, seed)
     files["checkpoint"].unlink(missing_ok=True)
     return int(found)
 
 
-def _files(out, surface, overwrite, resume):
+def _files(out, overwrite, resume):
     """Paths of what is written, by name; refuses those that are there."""
     folder = out.parent
     if folder.exists():
@@ -112,8 +104,6 @@ def _files(out, surface, overwrite, resume):
     elif out.suffix != ".toml":
         raise ValueError(f"{out}: a file of parameters is a .toml file")
     files = {"params": out, "csv": folder / "learn.csv", "figure": folder / "learn.png"}
-    if surface:
-        files["surface"] = folder / "surface.png"
     for path in files.values():
         if path.exists() and not overwrite:
             raise ValueError(f"{path}: exists; choose another folder or add --overwrite")
@@ -149,52 +139,19 @@ def _use_all_cores():
         jax.config.update("jax_num_cpu_devices", cores)
 
 
-def _windows(names, start, end, seconds, spacing, known):
-    """The parts of the logs, in windows; those without identities left out where these are needed
-    and the log has some."""
+def _windows(names, start, end, window, spacing, known):
+    """`split_log` of the logs of these names; warns of windows left out."""
+    from jaxslam.learning.data import split_log
     from jaxslam.logs.log_file import load_log
-    from jaxslam.logs.slicing import cut, spaced, windows
 
     parts = []
     for name in names:
         log = load_log(name)
-        log = cut(log, start, end) if start or end is not None else log
-        log = spaced(log, spacing)
-        found = windows(log, seconds) if seconds else [log]
-        if known and log.identity is not None and (log.identity >= 0).any():
-            blind = [part for part in found if len(part.frame) and part.identity.max() < 0]
-            if blind:
-                warn(f"{log.name}: {len(blind)} windows without any identity are left out")
-            found = [part for part in found if part not in blind]
-        parts += found
+        kept, blind = split_log(log, start, end, window, spacing, known)
+        if blind:
+            warn(f"{log.name}: {blind} windows without any identity are left out")
+        parts += kept
     return parts
-
-
-def _config(parts, sensor, association, particles, landmarks):
-    """A `Config` with room for every part, and how many measurements it has no use for, by why."""
-    import dataclasses
-
-    from jaxslam.filter.frames import frames_from_log
-    from jaxslam.runs.run import config_for
-
-    # Else doubles of landmarks would pay, and noise be learnt too small.
-    told = {"particles": particles, "uniform_association_prior": association == "sampled"}
-    told |= {"landmarks": landmarks} if landmarks else {}
-    told["descriptors"] = 0  # every part would have its own coordinates
-    made = [config_for(part, sensor, association, proposal="informed", **told) for part in parts]
-    config = dataclasses.replace(
-        made[0],
-        measurements=max(one.measurements for one in made),
-        landmarks=max(one.landmarks for one in made),
-    )
-    dropped = {}
-    for part in parts:
-        found = frames_from_log(
-            part, config.sensor, config.measurements, None, association == "known"
-        )
-        for why, count in found.dropped.items():
-            dropped[why] = dropped.get(why, 0) + count
-    return config, dropped
 
 
 def _task(train, config, path, parameters):
@@ -233,16 +190,6 @@ def _task(train, config, path, parameters):
     return Learning(start, names, *mine)
 
 
-def _pair(text, names):
-    """The two parameters of `--surface`."""
-    if not text:
-        return None
-    pair = tuple(name.strip() for name in text.split(","))
-    if len(set(pair)) != 2 or len(pair) != 2 or not set(pair) <= set(names):
-        raise ValueError(f"--surface is {text!r}; must be two of {', '.join(names)}")
-    return pair
-
-
 def _run_fit(train, judges, config, task, seeds, steps, seed, files, resume):
     """The fit; a stopped one says how to go on."""
     from jaxslam.learning.fit import fit
@@ -273,7 +220,7 @@ def _without_clip_warning():
 @contextmanager
 def _progress_printer(what):
     """A function for the progress of a fit: a bar, or a line now and then."""
-    with bar(what, compiles=True) as show:
+    with progress_bar(what, compiles=True) as show:
         if show:
             show(0, None)
         else:
@@ -296,12 +243,12 @@ def _assess(fit, train, judges, seed):
     from jaxslam.learning.report import Judged
     from jaxslam.learning.uncertainty import assess, improve
 
-    with bar("standard errors", compiles=True):
+    with progress_bar("standard errors", compiles=True):
         errors = assess(fit, train, seed=seed + 1)
     fit = improve(fit, errors)
     if not judges:
         return fit, errors, None
-    with bar("judging", compiles=True):
+    with progress_bar("judging", compiles=True):
         fresh = seed + 7919
         both = (evidence(judges, fit.config, p, FRESH, fresh) for p in (fit.start, fit.params))
         return fit, errors, Judged(*both)
@@ -316,21 +263,10 @@ def _write(fit, errors, task, files):
     # From the free scale and back, a value at its bound may be a rounding beyond it.
     at_bound = {n: min(max(getattr(fit.params, n), a), b) for n, (a, b) in task.bounds.items()}
     params = fit.params._replace(**at_bound)
-    with bar("writing"):
+    with progress_bar("writing"):
         save_params(files["params"], params, standard, task._replace(params=params))
         learn_report.save_csv(files["csv"], fit)
         learn_report.save_figure(learn_report.draw_learning(fit, errors), files["figure"])
-
-
-def _draw_surface(train, fit, errors, pair, path, seed):
-    """Draw the likelihood over a pair of parameters."""
-    from jaxslam.learning import report as learn_report
-    from jaxslam.learning import surface
-
-    with bar("surface", compiles=True) as progress:
-        found = surface.surface(train, fit, errors, pair, seed=seed + 2, progress=progress)
-    learn_report.save_figure(surface.draw_surface(found, fit, errors), path)
-    print(path)
 
 
 def _print_fit(fit, errors, judged, dropped, files):
@@ -347,17 +283,4 @@ def _print_fit(fit, errors, judged, dropped, files):
     flags = learn_report.flags(fit, errors, judged, dropped)
     for line in flags:
         warn(line)
-    sys.stdout.flush()  # what follows takes long
     return bool(flags)
-
-
-def _models(train, judges, fit, seeds, steps, seed):
-    """Print which sensor error model the held-out logs prefer; whether something went wrong."""
-    from jaxslam.learning import error_models
-
-    with bar("error models", compiles=True) as progress, _without_clip_warning():
-        rows = error_models.compare(
-            train, judges, fit.config, fit.params, fit.names, seeds, steps, seed, progress
-        )
-    print(f"\n{error_models.table(rows)}\n{error_models.preferred(rows)}")
-    return any(not row.finite for row in rows)

@@ -1,28 +1,77 @@
-"""What `jaxslam run` does, short or long; and what other commands share with it."""
+"""The command `run`: filter a log and smooth the result, in one process or in several."""
 
 import time
 import traceback
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
-from jaxslam.cli.common import bar, note, warn
-from jaxslam.runs import cluster
+from cyclopts import Group, Parameter
 
-FAULT = 70  # exit code of a process that fails by a fault of ours, told to the others
+from jaxslam.cli import common
+from jaxslam.cli.common import (
+    LogName,
+    Overwrite,
+    ParamFile,
+    Seed,
+    Sensor,
+    at_least,
+    note,
+    option,
+    progress_bar,
+    warn,
+)
+from jaxslam.config import ASSOCIATIONS, PROPOSALS
+from jaxslam.runs import cluster, supervisor
+
+FAULT = 70  # exit code of a process that fails by a bug, reported to the other processes
+FILTER, LONG, SEVERAL, PARALLEL = map(
+    Group.create_ordered, ("Filter", "Long runs", "Several runs", "Parallel")
+)
+ASSOCIATION = (
+    "Data association: maximum likelihood, identities from the log, or sampled per particle."
+)
+NO_SMOOTHING = "Write the filter's estimates only; do not smooth trajectory and map."
+PROPOSAL = (
+    "Draw poses from odometry (prior), or from odometry and measurements (informed, the default "
+    "for bearings with maximum likelihood)."
+)
+LANDMARKS = "Slots of the map (default: 64; with known association, one per landmark)."
+REJUVENATE = (
+    "Metres travelled after which the particles are redrawn from the smoothed posterior (default: "
+    "3 for bearings with maximum likelihood, otherwise never)."
+)
+DESCRIPTORS = (
+    "Appearance coordinates used in data association (default: all that distinguish landmarks, "
+    "for bearings with unknown association; otherwise 0)."
+)
+CHECKPOINT = "Save a checkpoint at this interval, e.g. 60s, 5m or 1h."
+RESUME = "Resume from the last checkpoint, if any; implies --checkpoint-every 60s."
+SEEDS = "Repeat the run for each seed, e.g. 0-9 or 1,4,7-9, and print a table."
+SWEEP = (
+    "Repeat the run for each value of a parameter, e.g. err_rot=0.05,0.1. May be given more than "
+    "once."
+)
+DEVICES = "Devices of this process that share the particles, or the runs of --seeds and --sweep."
+COORDINATOR = "HOST:PORT where process 0 waits for the others; 127.0.0.1:PORT on one machine."
+PROCESSES = "Processes that share the run (default: as Slurm or Open MPI started)."
+PROCESS = "Index of this process, from 0. Only process 0 writes files and prints."
 
 
 class CheckpointOptions(NamedTuple):
-    """Options of a run that is put aside: `every` so often, as text; `resume`: go on with it."""
+    """Checkpoints of a run: the interval, as text, and whether to resume from one."""
 
     every: str
     resume: bool
 
 
-class Task(NamedTuple):
-    """What `jaxslam run` is to do. `name`: the log's as given; `part`: only a part of it is used;
-    `shared`: by several processes."""
+class RunOptions(NamedTuple):
+    """What to run and where to write it.
+
+    `name`: the log's name or path as given; `part`: only a part of that log is used; `shared`: by
+    several processes.
+    """
 
     log: object
     config: object
@@ -32,8 +81,8 @@ class Task(NamedTuple):
     name: str
     part: bool
     overwrite: bool
-    no_refine: bool
-    long: CheckpointOptions | None
+    no_smoothing: bool
+    checkpoints: CheckpointOptions | None
     shared: bool
 
     @property
@@ -41,29 +90,100 @@ class Task(NamedTuple):
         return None if self.part else self.name
 
 
-def build_model(
+def run(
+    log: LogName,
+    /,
+    *,
+    sensor: Sensor = None,
+    association: option(Literal[ASSOCIATIONS], ASSOCIATION) = "maximum_likelihood",
+    particles: at_least("Number of particles.") = 1000,
+    params: ParamFile = None,
+    seed: Seed = 0,
+    out: option(Path, "Folder to write (default: runs/LOG-SENSOR-SEED).") | None = None,
+    overwrite: Overwrite = False,
+    no_smoothing: option(bool, NO_SMOOTHING) = False,
+    no_refine: Annotated[bool, Parameter(show=False)] = False,  # its name in version 0.1
+    proposal: option(Literal[PROPOSALS], PROPOSAL, FILTER) | None = None,
+    landmarks: at_least(LANDMARKS, group=FILTER) | None = None,
+    paper: option(bool, common.PAPER, FILTER) = False,
+    rejuvenate: option(float, REJUVENATE, FILTER) | None = None,
+    descriptors: at_least(DESCRIPTORS, 0, group=FILTER) | None = None,
+    start: option(float, common.START, FILTER) = 0.0,
+    end: option(float, common.END, FILTER) | None = None,
+    checkpoint_every: option(str, CHECKPOINT, LONG) | None = None,
+    resume: option(bool, RESUME, LONG) = False,
+    seeds: option(str, SEEDS, SEVERAL) | None = None,
+    sweep: option(tuple[str, ...], SWEEP, SEVERAL) = (),
+    devices: at_least(DEVICES, group=PARALLEL) = 1,
+    coordinator: option(str, COORDINATOR, PARALLEL) | None = None,
+    num_processes: at_least(PROCESSES, group=PARALLEL) | None = None,
+    process_id: at_least(PROCESS, 0, group=PARALLEL) | None = None,
+):
+    """Filter a log and smooth the result; write trajectory, map, figures and errors.
+
+    Use trajectory_refined.tum and landmarks_refined.csv, smoothed over all frames;
+    trajectory.tum and landmarks.csv are the filter's estimates at each frame.
+    The folder also holds map.png, summary.json and run.toml with every setting.
+
+    Example: jaxslam run lost-in-the-woods --particles 2000 --out runs/woods
+    """
+    address = cluster.find_address(coordinator, num_processes, process_id)
+    if address and address.process:
+        supervisor.run_supervised()
+    with progress_bar("reading", shown=address is None or address.process == 0):
+        from jaxslam.logs.log_file import load_log
+        from jaxslam.logs.slicing import cut
+
+        loaded, part = load_log(log), bool(start) or end is not None
+        loaded = cut(loaded, start, end) if part else loaded
+    several = seeds is not None or sweep
+    if several and (checkpoint_every or resume or address):
+        raise ValueError("--seeds and --sweep are for small runs: without checkpoints, one process")
+    total = 1 if several else devices * (address.processes if address else 1)
+    model = config_from_options(
+        loaded, sensor, association, particles, landmarks, params, paper, proposal, total,
+        rejuvenate, descriptors,
+    )  # fmt: skip
+    name = seed if seeds is None else f"seeds-{seeds}"
+    out = out or Path("runs") / f"{Path(log).stem}-{model[0].sensor}-{name}"
+    use_devices(devices)
+    checkpoints = None
+    if checkpoint_every or resume:
+        checkpoints = CheckpointOptions(checkpoint_every or "60s", resume)
+    options = RunOptions(
+        loaded, *model, seed, out, log, part, overwrite, no_smoothing or no_refine, checkpoints,
+        shared=address is not None,
+    )  # fmt: skip
+    if several:
+        return run_batch(options, str(seed) if seeds is None else seeds, sweep, devices)
+    if address is None:
+        return run_alone(options)
+    return run_shared(options, address)
+
+
+def config_from_options(
     log, sensor, association, particles, landmarks, params, paper, proposal=None, devices=1,
     rejuvenate=None, descriptors=None,
 ):  # fmt: skip
-    """`Config` and `Params` as the options say."""
+    """`Config` and `Params` from the command's options; None for an option that is not given."""
     from jaxslam.config import Config
     from jaxslam.parameter_file import load_params
     from jaxslam.parameters import default_params
     from jaxslam.runs.run import config_for
 
     if particles % devices:
-        least = particles // devices * devices
-        fit = f"{least} or {least + devices}" if least else devices
+        below = particles // devices * devices
+        fit = f"{below} or {below + devices}" if below else devices
         raise ValueError(
             f"--particles is {particles}, which {devices} devices can't share evenly; take {fit}"
         )
-    told = {"particles": particles, "landmarks": landmarks, "proposal": proposal}
-    told = {name: value for name, value in told.items() if value}
+    settings = {"particles": particles, "landmarks": landmarks, "proposal": proposal}
+    settings = {name: value for name, value in settings.items() if value}
     if descriptors is not None:
         if paper:
-            raise ValueError("--descriptors: the paper's rules (--paper) associate by place alone")
-        told["descriptors"] = descriptors
-    config = config_for(log, sensor or ("position" if paper else None), association, **told)
+            raise ValueError("--descriptors: with --paper, association uses positions alone")
+        settings["descriptors"] = descriptors
+    config = config_for(log, sensor or ("position" if paper else None), association, **settings)
     if paper:
         sizes = config.particles, config.landmarks, config.measurements
         rules = {"sensor": config.sensor, "association": association}
@@ -74,131 +194,141 @@ def build_model(
     return config, load_params(params, base) if params else base
 
 
-def run_filter(task, checkpoints=None):
-    """A run's result; with progress bars."""
+def run_filter(options, checkpoints=None):
+    """Filter and, unless --no-smoothing, refine with progress bars; return the `Result`."""
     from jaxslam.runs import run
 
     with (
-        bar("filtering", compiles=True) as progress,
-        cluster.silence_stderr() if task.shared else nullcontext(),
+        progress_bar("filtering", compiles=True) as progress,
+        cluster.silence_stdout() if options.shared else nullcontext(),
     ):
         result = run.run(
-            task.log,
-            task.config,
-            task.params,
-            task.seed,
+            options.log,
+            options.config,
+            options.params,
+            options.seed,
             progress,
             refine=False,
             checkpoints=checkpoints,
         )
-    if task.no_refine:
+    if options.no_smoothing:
         return result
-    with bar("refining") as progress:
+    with progress_bar("refining") as progress:
         return run.refine_result(result, progress)
 
 
 def use_devices(count):
-    """Let JAX have so many devices on a CPU, if it has not begun; on GPUs this does nothing."""
+    """Let JAX split the CPU into `count` devices; has no effect on GPUs."""
     if count == 1:
         return
     import jax
 
-    with suppress(RuntimeError):  # a process that has computed already keeps its devices
+    with suppress(RuntimeError):  # after the first computation the devices are fixed
         jax.config.update("jax_num_cpu_devices", count)
 
 
-def run(task):
-    """Filter, refine and write: the command in one process, or in the one that leads."""
-    result = _run_long(task) if task.long else _run_short(task)
+def run_alone(options):
+    """Filter, smooth and write, in a single process or in process 0; return the exit code."""
+    result = _run_with_checkpoints(options) if options.checkpoints else _run_at_once(options)
     return int(bool(result and result.flags))
 
 
-def _run_short(task):
+def _run_at_once(options):
     from jaxslam.results import run_folder
 
-    run_folder.check_target(task.out, task.overwrite)
-    result = run_filter(task)
-    with bar("writing"):
-        run_folder.save(result, task.out, task.overwrite, log_source=task.source)
-    print_summary(result, task.out)
+    run_folder.check_target(options.out, options.overwrite)
+    result = run_filter(options)
+    with progress_bar("writing"):
+        run_folder.save(result, options.out, options.overwrite, log_source=options.source)
+    print_summary(result, options.out)
     return result
 
 
-def _run_long(task):
-    """A run that is put aside now and then; None if it was finished already."""
+def _run_with_checkpoints(options):
+    """Run with checkpoints; return the `Result`, or None if the run had finished before."""
     from jaxslam.results import run_folder
-    from jaxslam.runs import checkpoints as offline
+    from jaxslam.runs import checkpoints as checkpointing
 
-    out, overwrite, (every, resume) = task.out, task.overwrite, task.long
-    every = offline.parse_interval(every)
+    out, overwrite, (every, resume) = options.out, options.overwrite, options.checkpoints
+    every = checkpointing.parse_interval(every)
     if overwrite and resume:
-        raise ValueError("--resume goes on with a run, --overwrite replaces it; choose one")
-    _check_beside(task)
-    with offline.Checkpoints(out, every, resume, overwrite) as checkpoints:
+        raise ValueError("--resume continues a run, --overwrite replaces it; choose one")
+    _check_log_outside(options)
+    with checkpointing.Checkpoints(out, every, resume, overwrite) as checkpoints:
         if checkpoints.finished:
-            offline.check_finished(out, task.log, task.config, task.params, task.seed)
+            checkpointing.check_finished(
+                out, options.log, options.config, options.params, options.seed
+            )
             print(f"{out}: is finished already; nothing to do")
             return None
-        result = run_filter(task, checkpoints)
-        with bar("writing"):
-            run_folder.save_into(result, out, log_source=task.source)
+        result = run_filter(options, checkpoints)
+        with progress_bar("writing"):
+            run_folder.save_into(result, out, log_source=options.source)
         checkpoints.clear()
     print_summary(result, out)
     return result
 
 
-def _check_beside(task):
-    """Raise `ValueError` if the log is where results are replaced."""
-    if Path(task.name).resolve().is_relative_to(task.out.resolve()):
+def _check_log_outside(options):
+    """Raise `ValueError` if the log lies in the folder whose files are replaced."""
+    if Path(options.name).resolve().is_relative_to(options.out.resolve()):
         raise ValueError(
-            f"{task.name}: is in {task.out}, where results are replaced; choose another --out"
+            f"{options.name}: is in {options.out}, where results are replaced; choose another --out"
         )
 
 
-def run_shared(task, place, guarded):
-    """The command in one of several processes; does not return once they have met."""
+def run_shared(options, address):
+    """Take part in a run of several processes. Ends this process once all have met."""
     from jaxslam.results import run_folder
-    from jaxslam.runs import checkpoints as offline
+    from jaxslam.runs.checkpoints import run_fingerprint
 
     run = {
-        **offline.run_fingerprint(task.log, task.config, task.params, task.seed),
-        "devices": task.config.devices,
-        "out": str(task.out),
-        "long": str(task.long),
-        "refined": not task.no_refine,
+        **run_fingerprint(options.log, options.config, options.params, options.seed),
+        "devices": options.config.devices,
+        "out": str(options.out),
+        "long": str(options.checkpoints),
+        "refined": not options.no_smoothing,
         "versions": run_folder.versions(),
     }
-    team = cluster.Team(place, cluster.rendezvous(place, run))
+    group = cluster.ProcessGroup(address, cluster.rendezvous(address, run))
     code = FAULT
     try:
-        code = guarded(lambda: _share(task, place, team))
+        code = common.run_command(lambda: _run_as_member(options, address, group))
     except Exception:
         traceback.print_exc()
     finally:
-        team.leave(code)
+        group.exit(code)
 
 
-def _share(task, place, team):
-    from jaxslam.runs import checkpoints as offline
+def _run_as_member(options, address, group):
     from jaxslam.runs import run
+    from jaxslam.runs.checkpoints import FollowerCheckpoints
 
     try:
-        cluster.connect(place)
-        if team.leads:
-            return run(task)
-        follow = offline.FollowerCheckpoints(task.out, team.wait) if task.long else None
-        with cluster.silence_stderr():
-            run.run(task.log, task.config, task.params, task.seed, refine=False, checkpoints=follow)
-        team.wait()
+        cluster.connect(address)
+        if group.is_leader:
+            return run_alone(options)
+        wait = group.wait_for_leader
+        follow = FollowerCheckpoints(options.out, wait) if options.checkpoints else None
+        with cluster.silence_stdout():
+            run.run(
+                options.log,
+                options.config,
+                options.params,
+                options.seed,
+                refine=False,
+                checkpoints=follow,
+            )
+        wait()
     except RuntimeError as error:
-        if "Gloo" not in str(error):
+        if not common.is_lost_connection(error):
             raise
-        time.sleep(cluster.GRACE)  # whoever died is told meanwhile
+        time.sleep(cluster.EXIT_TIMEOUT)  # `group` learns which process died, and reports it
         raise ConnectionError("the connection to another process broke") from None
 
 
 def print_summary(result, out):
-    """Print what a run found, its advice and its warnings."""
+    """Print errors, times and the run folder; advice and warnings on stderr."""
     from jaxslam.results import run_folder
     from jaxslam.results.tables import error_table
 
@@ -213,21 +343,21 @@ def print_summary(result, out):
         warn(line)
 
 
-def run_many(task, seeds, sweep, devices):
-    """A table of runs, with a folder for each; the exit code."""
+def run_batch(options, seeds, sweep, devices):
+    """Run all seeds and parameter values, print their table, and return the exit code."""
     from jaxslam.runs import batch
 
-    todo = batch.plan_tasks(seeds, task.params, sweep)
-    _check_beside(task)
-    batch.check_target(task.out, task.overwrite)
-    with bar("running", compiles=True) as progress:
+    tasks = batch.plan_tasks(seeds, options.params, sweep)
+    _check_log_outside(options)
+    batch.check_target(options.out, options.overwrite)
+    with progress_bar("running", compiles=True) as progress:
         results = batch.run_tasks(
-            task.log, task.config, todo, progress, not task.no_refine, devices
+            options.log, options.config, tasks, progress, not options.no_smoothing, devices
         )
-    with bar("writing"):
-        batch.save(todo, results, task.out, task.overwrite, task.source)
-    print(batch.table(batch.summary_rows(todo, results)))
-    print(f"{task.out}: the table is {task.out / batch.TABLE}, with a folder for each run")
+    with progress_bar("writing"):
+        batch.save(tasks, results, options.out, options.overwrite, options.source)
+    print(batch.format_runs(batch.summary_rows(tasks, results)))
+    print(f"{options.out}: the table is {options.out / batch.TABLE}, with a folder for each run")
     for line in dict.fromkeys(line for result in results for line in result.flags):
         warn(line)
     return int(any(result.flags for result in results))

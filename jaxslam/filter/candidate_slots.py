@@ -1,8 +1,7 @@
-"""Which slots a frame can concern: judged once, for all particles together, before any of them
-looks at a landmark.
+"""Select the slots that a frame can concern, once for all particles, from bounds on each slot.
 
-Every slot has bounds that hold for all its particles. A slot is passed over only if in no particle
-it can be in view, nor match any measurement: the result is that of looking at every slot.
+A slot is left out only if in no particle it can be in view or match a measurement: the result is
+that of using every slot.
 """
 
 from typing import NamedTuple
@@ -13,12 +12,12 @@ import jax.numpy as jnp
 from jaxslam.filter import new_landmarks, sharding
 from jaxslam.models import geometry, sensors
 
-FEW = 32  # slots are all looked at
+FEW = 32  # slots are all candidates
 
 
 class SlotBounds(NamedTuple):
-    """Of every slot: the box `low`, `high` [2, M] of its means, the largest trace `spread` [M] of
-    their covariances, and whether any particle has `used` [M] it. Never too narrow."""
+    """Bounds on every slot over all particles: the box `low`, `high` [2, M] of means, the largest
+    trace `spread` [M] of covariances, and whether any particle has `used` [M] it."""
 
     low: jax.Array
     high: jax.Array
@@ -27,7 +26,7 @@ class SlotBounds(NamedTuple):
 
 
 def bounds_of(world):
-    """`Bounds` of these landmarks [.., M, N]."""
+    """`SlotBounds` of landmarks [.., M, N]."""
     there = world.count > 0
     l11, l21, l22 = world.factor
     return SlotBounds(
@@ -39,13 +38,13 @@ def bounds_of(world):
 
 
 def empty_bounds(config, dtype):
-    """`Bounds` of no landmarks at all."""
+    """`SlotBounds` of no landmarks."""
     low = jnp.full((2, config.landmarks), jnp.inf, dtype)
     return SlotBounds(low, -low, jnp.zeros_like(low[0]), jnp.zeros(low.shape[1], bool))
 
 
 def widen(bounds, world, slots):
-    """The bounds, wide enough for more landmarks [.., S, n] in these slots [S]."""
+    """Widen the bounds to more landmarks [.., S, n] in these slots [S]."""
     low, high, spread, used = bounds_of(world)
     at = bounds.low.at[:, slots], bounds.high.at[:, slots]
     return SlotBounds(
@@ -57,7 +56,7 @@ def widen(bounds, world, slots):
 
 
 def merge_devices(bounds, config):
-    """The bounds that hold on every device, from its own."""
+    """Merge the devices' bounds into those of all particles."""
     used = jnp.where(bounds.used, -1.0, 0.0).astype(bounds.spread.dtype)
     low, high, spread, used = jnp.split(
         sharding.all_min(
@@ -68,26 +67,25 @@ def merge_devices(bounds, config):
     return SlotBounds(low, -high, -spread[0], used[0] < 0)
 
 
-def lift(bounds, born):
-    """The bounds without any for slots [M] in which landmarks were `born`, until next looked at."""
+def lift(bounds, new):
+    """Remove the bounds of slots [M] with `new` landmarks, until these are next updated."""
     return SlotBounds(
-        jnp.where(born, -jnp.inf, bounds.low),
-        jnp.where(born, jnp.inf, bounds.high),
-        jnp.where(born, jnp.inf, bounds.spread),
-        bounds.used | born,
+        jnp.where(new, -jnp.inf, bounds.low),
+        jnp.where(new, jnp.inf, bounds.high),
+        jnp.where(new, jnp.inf, bounds.spread),
+        bounds.used | new,
     )
 
 
-def select_candidates(config, bounds, sensor_pose, measurements, alike, params, extra):
-    """Slots [M] that some particle's look may concern.
+def select_candidates(config, bounds, sensor_pose, measurements, ratios, params, extra):
+    """Select candidate slots [M].
 
-    `known`: those named, and if landmarks are forgotten all that may be in view. Bearings alone
-    reach any distance, and what is `sampled` may be drawn at any: all slots in use (also with
-    positions under the informed proposal). Else those that
-    some particle may have in view or match. A density is at most the normaliser of the
-    measurement's own noise, less half the square of the range's innovation over its variance.
-    `alike` [K, M]: log likelihood ratios of looks, or None. `extra`: variance that the pose adds to
-    a range, at most.
+    `known`: the identities' slots, and if landmarks are forgotten all that may be in view. Bearings
+    alone, `sampled` matches, and positions under the informed proposal: all slots in use. Else
+    those that some particle may have in view or match: a log density is at most the log normaliser
+    of the measurement's noise, minus half the square of the range's innovation over its variance.
+    `ratios` [K, M]: log-likelihood ratios of appearance, or None. `extra`: largest variance that
+    the pose adds to a range.
     """
     used = bounds.used
     if config.landmarks <= FEW and config.association != "known":
@@ -95,10 +93,10 @@ def select_candidates(config, bounds, sensor_pose, measurements, alike, params, 
     slots = jnp.arange(len(used))
     known = config.association == "known"
     if known:
-        named = (measurements.identity[:, None] == slots) & measurements.valid[:, None]
+        identified = (measurements.identity[:, None] == slots) & measurements.valid[:, None]
         if not config.forgetting:
-            return named.any(0)
-        used = used | named.any(0)
+            return identified.any(0)
+        used = used | identified.any(0)
     informed_position = config.sensor == "position" and config.proposal == "informed"
     if config.sensor == "bearing" or config.association == "sampled" or informed_position:
         return used
@@ -108,9 +106,9 @@ def select_candidates(config, bounds, sensor_pose, measurements, alike, params, 
     here_low, here_high, extra = ends[:2], -ends[2:4], -ends[4]
     gap = jnp.maximum(bounds.low - here_high[:, None], here_low[:, None] - bounds.high)
     nearest = jnp.hypot(*jnp.maximum(gap, 0.0)) * 0.9999
-    concerns = ~(nearest >= params.view_range)  # what is not a number concerns
+    concerns = ~(nearest >= params.view_range)  # NaN concerns
     if known:
-        return (used & concerns) | named.any(0)
+        return (used & concerns) | identified.any(0)
     value, threshold = _thresholds(config, measurements, params)
     if config.sensor == "range_bearing":
         far, variance = value[:, 0], params.sigma_range**2
@@ -123,14 +121,14 @@ def select_candidates(config, bounds, sensor_pose, measurements, alike, params, 
     beyond = jnp.maximum(nearest - far[:, None], 0.0)
     variance = jnp.broadcast_to(variance, far.shape)[:, None] + bounds.spread + extra
     bound = jnp.broadcast_to(top, far.shape)[:, None] - 0.499 * beyond**2 / variance
-    if alike is not None:
-        bound = bound + alike
+    if ratios is not None:
+        bound = bound + ratios
     matches = ~(bound <= threshold[:, None]) & measurements.valid[:, None]
     return used & (concerns | matches.any(0))
 
 
 def _thresholds(config, measurements, params):
-    """Values [K, 2], and log densities [K] that a match has to beat."""
+    """Values [K, 2], and log densities [K] that a match has to exceed."""
     new = sensors.log_new_density(config.sensor, tuple(measurements.value.T), params)
     clutter = sensors.log_clutter_density(config.sensor, params)
     return measurements.value, jnp.maximum(new, clutter) - 1e-3

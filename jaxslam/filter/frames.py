@@ -1,19 +1,22 @@
-"""From a log to what the filter eats: one odometry increment and one padded row per frame."""
+"""Convert a log to frames: odometry since the frame before, and K measurements, padded."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.logs.appearance_space import fit_appearance_space
+from jaxslam.config import SENSORS
 from jaxslam.logs.odometry import Odometry, increments
 from jaxslam.models.sensors import Measurements
 from jaxslam.parameters import default_params
 
 
 class Frames(NamedTuple):
-    """T frames in K slots each: `time` int64 [T] ns, `odometry` of the interval that ends there,
-    `measurements`, log identities of the dense ones [I], each slot's row in the log [T, K] (-1:
-    padding), and how many rows were dropped, by reason."""
+    """T frames of up to K measurements.
+
+    `time`: int64 [T], ns. `odometry`: of the intervals that end there, leaves [T]. `measurements`:
+    leaves [T, K, ..], with identities 0 to I - 1. `identities` [I]: these in the log. `row` [T, K]:
+    each measurement's row in the log (-1: padding). `dropped`: counts of rows left out, by reason.
+    """
 
     time: np.ndarray
     odometry: Odometry
@@ -23,32 +26,32 @@ class Frames(NamedTuple):
     dropped: dict[str, int]
 
 
-def frames_from_log(log, sensor, measurements=None, params=None, known=False, descriptors=0):
-    """`Frames` of a log for one sensor.
+def frames_from_log(log, config, params=None):
+    """`Frames` of a log, as a `Config` wants them: sensor, K measurements, identities, descriptors.
 
-    `measurements`: slots per frame (None: as many as the fullest frame needs); beyond them the
-    farthest are dropped, or the last where there is no range. `params` gives the noise when
-    positions are made of ranges and bearings. `known`: hand over the measured identities; otherwise
-    they are hidden. `descriptors`: coordinates of their looks handed over. Raises
-    `ValueError` when the log can't supply what is asked.
+    Of a frame with more than K measurements the farthest are dropped, or the last where there is no
+    range. Identities are handed over only to association `known`. `params` (None: `default_params`)
+    give the noise of positions computed from ranges and bearings. Raises `ValueError` when the log
+    lacks the sensor, the identities or the descriptors.
     """
+    sensor, known = config.sensor, config.association == "known"
     if not log.has(sensor):
-        has = [name for name in ("position", "range_bearing", "bearing") if log.has(name)]
+        has = [name for name in SENSORS if log.has(name)]
         raise ValueError(
             f"{log.name}: sensor {sensor!r} is not in this log; it has {' '.join(has)}"
         )
-    value, cov, reach = _values(log, sensor, params)
-    # A bearing without a point is no position; nothing of it is lost, so nothing is counted.
+    value, cov, distance = _values(log, sensor, params)
+    # A bearing without a point is no position: nothing is lost with it, so it is not counted.
     rows = np.flatnonzero(np.isfinite(value).all(axis=1))
     dropped = {}
     identity, identities = np.full(len(log.frame), -1), np.empty(0, np.int64)
     if known:
         rows = _with_identity(log, rows, dropped)
         identities, identity[rows] = np.unique(log.identity[rows], return_inverse=True)
-    rows, slot, slots = _slots(log, rows, reach, measurements, dropped)
-    row = np.full((len(log.frame_time), slots), -1)
-    row[log.frame[rows], slot] = rows
-    # Padding, row -1, reads the last row, which is appended here.
+    rows, column = _place(log, rows, distance, config.measurements, dropped)
+    row = np.full((len(log.frame_time), config.measurements), -1)
+    row[log.frame[rows], column] = rows
+    # Padding (row -1) reads the last row, which is appended here.
     return Frames(
         time=log.frame_time,
         odometry=increments(log),
@@ -59,7 +62,7 @@ def frames_from_log(log, sensor, measurements=None, params=None, known=False, de
             identity=np.append(identity, -1)[row].astype(np.int32),
             valid=row >= 0,
             active=np.ones(len(row), bool),
-            **_appearance_columns(log, descriptors, row),
+            **_appearance_columns(log, config.descriptors, row),
         ),
         identities=identities,
         row=row,
@@ -68,7 +71,7 @@ def frames_from_log(log, sensor, measurements=None, params=None, known=False, de
 
 
 def _values(log, sensor, params):
-    """Values [n, 2], covariances [n, 3] (xx, xy, yy) and distances (None: unknown) of all rows."""
+    """Values [n, 2], covariances [n, 3] and distances [n] (None: unknown) of all rows."""
     cov = np.zeros((len(log.frame), 3))
     if sensor == "bearing":
         return np.column_stack([log.bearing, np.zeros(len(log.frame))]), cov, None
@@ -86,28 +89,28 @@ def _values(log, sensor, params):
 
 
 def _appearance_columns(log, size, row):
-    """`Measurements.descriptor` [T, K, J] and `within` [T, J] of the slots' rows."""
+    """`Measurements.descriptor` [T, K, J] and `within` [T, J] of rows [T, K]."""
     if not size:
         return {}
-    found = fit_appearance_space(log)
-    if len(found.within) < size:
+    space = log.appearance_space
+    if len(space.within) < size:
         raise ValueError(
-            f"{log.name}: {size} descriptors are asked for, but {len(found.within)} tell landmarks "
+            f"{log.name}: {size} descriptors are asked for, but {len(space.within)} tell landmarks "
             "apart in this log (of a part of a log: make its own config, or take 0)"
         )
-    coordinates = np.vstack([found.coordinates[:, :size], np.zeros((1, size))])
-    return dict(descriptor=coordinates[row], within=np.tile(found.within[:size], (len(row), 1)))
+    coordinates = np.vstack([space.coordinates[:, :size], np.zeros((1, size))])
+    return dict(descriptor=coordinates[row], within=np.tile(space.within[:size], (len(row), 1)))
 
 
 def _scale(log, sensor, row):
-    """`Measurements.scale` of the slots' rows [T, K]; None where no size rests on odometry."""
+    """`Measurements.scale` of rows [T, K]; None where no position rests on odometry."""
     if sensor != "position" or not log.has_points() or log.point_baseline is None:
         return None
     return np.append(np.isfinite(log.point_baseline), False)[row].astype(float)
 
 
 def _with_identity(log, rows, dropped):
-    """Those of the rows that carry an identity, the first of each identity in a frame."""
+    """The rows with an identity, of each identity in a frame the first."""
     if log.identity is None or (len(log.identity) and (log.identity < 0).all()):
         raise ValueError(f"{log.name}: association 'known' needs identities; this log has none")
     _count(dropped, "no identity", int((log.identity[rows] < 0).sum()))
@@ -118,19 +121,18 @@ def _with_identity(log, rows, dropped):
     return rows[first]
 
 
-def _slots(log, rows, reach, slots, dropped):
-    """The rows that find a slot, in the log's order, their slots, and the number of slots."""
-    if slots is None:
-        slots = max(1, np.bincount(log.frame[rows], minlength=1).max())
-    rank = _rank(log.frame[rows]) if reach is None else _rank(log.frame[rows], reach[rows])
-    keep = rank < slots
+def _place(log, rows, distance, most, dropped):
+    """The `most` nearest rows of every frame, in the log's order, and their places in the frame."""
+    order = None if distance is None else distance[rows]
+    rank = _rank(log.frame[rows], order)
+    keep = rank < most
     _count(dropped, "no measurement slot", int((~keep).sum()))
     rows = rows[keep]
-    return rows, _rank(log.frame[rows]), int(slots)
+    return rows, _rank(log.frame[rows])
 
 
 def _rank(frame, order=None):
-    """Place of every row among those of its frame, by `order` or as they come; frames sorted."""
+    """Rank of every row within its frame (sorted), by `order` or as they come."""
     first = np.searchsorted(frame, frame)
     place = np.arange(len(frame)) - first
     if order is None:

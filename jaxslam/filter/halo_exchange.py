@@ -1,8 +1,8 @@
-"""Ancestors nearby: what a device needs of its neighbours' particles, when that is little.
+"""Halo exchange: send only boundary particles to neighbouring devices, where these suffice.
 
-Systematic resampling keeps particles in order, and so does one after the other: what a device's
-particles continue is its own, but for a stretch at either end. If on every device these stretches,
-and what they continue, fit into borders of an eighth of its particles, only the borders travel.
+Systematic resampling, also repeated, keeps particles in order: the ancestors of a device's
+particles are its own, except near both ends. If on every device these exceptions and their
+ancestors fit into halos of an eighth of its particles, only the halos are sent.
 """
 
 import jax
@@ -11,16 +11,16 @@ import jax.numpy as jnp
 from jaxslam.filter import sharding
 from jaxslam.filter.xla import barrier, row_start
 
-SHARE = 8  # of a device's particles one in so many belongs to a border
+SHARE = 8  # one in so many of a device's particles belongs to a halo
 
 
 def width(config):
-    """Particles [b] of a border; 0: there are none."""
+    """Number b of particles of a halo; 0: there are none."""
     return 0 if config.devices == 1 else config.particles // config.devices // SHARE
 
 
 def suffices(index, config):
-    """Whether borders suffice, on every device, for `index` [.., N], ancestors in order: [..]."""
+    """Whether halos suffice, on every device, for sorted ancestors `index` [.., N]: [..]."""
     n, b = config.particles // config.devices, width(config)
     index = index.reshape(*index.shape[:-1], config.devices, n)
     low = jnp.arange(config.devices, dtype=index.dtype) * n
@@ -29,9 +29,8 @@ def suffices(index, config):
 
 
 def exchange_halos(world, slots, config):
-    """The neighbours' borders of landmarks in the slots, a list of S, in one message: of every leaf
-    [.., M, n] the last b of the particles before one's own, and the first b of those after them
-    [.., S, 2 b]."""
+    """Exchange halos of landmarks in S slots, in one message: of every leaf [.., M, n] the last b
+    particles of the device before and the first b of the device after, [.., S, 2 b]."""
     b, leaves, kind = width(config), *jax.tree.flatten(world)
 
     def ends(leaf, slot):
@@ -41,21 +40,21 @@ def exchange_halos(world, slots, config):
         )
         return jnp.concatenate([first, last], -1)
 
-    found = [jnp.concatenate([ends(leaf, slot) for slot in slots], -2) for leaf in leaves]
-    return jax.tree.unflatten(kind, barrier(sharding.exchange_with_neighbours(found, b, config)))
+    halos = [jnp.concatenate([ends(leaf, slot) for slot in slots], -2) for leaf in leaves]
+    return jax.tree.unflatten(kind, barrier(sharding.exchange_with_neighbours(halos, b, config)))
 
 
-def gather_row(leaf, border, slot, index, config):
-    """A leaf [.., M, n] with the slot's landmarks taken at `index` [n] of all particles, of its own
-    and its neighbours' `border` [.., 2 b]."""
+def gather_row(leaf, halo, slot, index, config):
+    """Gather a slot's landmarks of a leaf [.., M, n] at `index` [n] of all particles, from the
+    device's own and the neighbours' `halo` [.., 2 b]."""
     n, b = leaf.shape[-1], width(config)
-    own = index - jax.lax.axis_index(sharding.AXIS) * n
-    head, tail = own[:b], own[n - b :]
+    local = index - jax.lax.axis_index(sharding.AXIS) * n
+    head, tail = local[:b], local[n - b :]
     rows = leaf.reshape(-1, *leaf.shape[-2:])
-    for i, side in enumerate(border.reshape(-1, 2 * b)):
+    for i, side in enumerate(halo.reshape(-1, 2 * b)):
         row = jax.lax.dynamic_slice(rows, row_start(rows, slot, 0, i), (1, 1, n))[0, 0]
-        # Pinned: joined with what is put, reading would need a copy of the map.
-        inside = barrier(_at(row, own, 0, n))
+        # A barrier: fused with the writing, reading would need a copy of the map.
+        inside = barrier(_at(row, local, 0, n))
         parts = (
             inside,
             jnp.where(head < 0, _at(side, head + b, 0, b), inside[:b]),
@@ -69,5 +68,5 @@ def gather_row(leaf, border, slot, index, config):
 
 
 def _at(row, index, low, high):
-    """Of a row, what is at the indices; those out of [low, high) get anything."""
+    """Values of a row at indices; those outside [low, high) get anything."""
     return row.at[jnp.clip(index, low, high - 1)].get(mode="promise_in_bounds")

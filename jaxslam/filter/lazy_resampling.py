@@ -1,11 +1,10 @@
-"""Lazy resampling: landmarks stay where they are, and are read through their ancestors when needed.
+"""Lazy resampling: landmarks are resampled through composed ancestors when next used.
 
-Resampling replaces every particle by a copy of its ancestor, map and all. Copying the whole map
-costs more than all else once the map is large, and most of it is not even in view. So only the
-ancestors are recorded. Slots that were last brought up to date between the same two resamplings
-share a chain, which is composed as it grows: `chains[g, i]` is the particle that held then what
-belongs to particle i now. There are few chains; when a new one is needed and all are in use, the
-slots of the oldest are brought up to date.
+Copying the whole map at every resampling costs more than all else once the map is large, and most
+of it is not in view. So only ancestors are recorded. Slots that were last resampled between the
+same two resamplings share a chain: `chains[g, i]` is the particle that held then what belongs to
+particle i now. There are few chains; when a new one is needed and all are in use, the slots of the
+oldest are resampled.
 """
 
 from functools import partial
@@ -18,12 +17,12 @@ from jaxslam.filter import halo_exchange, sharding
 from jaxslam.filter.xla import nonzero_indices, repeat
 
 CURRENT = -1
-TOGETHER = 2**18  # particles of all rows in one message
+TOGETHER = 2**18  # particles of all rows of one message
 
 
 class Ancestry(NamedTuple):
-    """`chains` [G, N] of particles; `begun` [G]: number of the resampling each began with;
-    `chain` [M]: that of every slot, or `CURRENT`; `count` []: resamplings so far."""
+    """Resampling still to be done: `chains` [G, N] of composed ancestors; `begun` [G]: number of
+    the resampling that began each; `chain` [M] of every slot, or `CURRENT`; `count` [] so far."""
 
     chains: jax.Array
     begun: jax.Array
@@ -32,7 +31,7 @@ class Ancestry(NamedTuple):
 
 
 def empty_ancestry(config):
-    """Nothing to catch up with."""
+    """`Ancestry` of a map that is resampled already."""
     size = min(config.chains, config.landmarks)
     return Ancestry(
         chains=jnp.zeros((size, config.particles), jnp.int32),
@@ -43,9 +42,9 @@ def empty_ancestry(config):
 
 
 def apply_ancestry(world, ancestry, wanted, config):
-    """The map with the slots `wanted` [M] (or all: True) brought up to date.
+    """Resample the slots `wanted` [M] (True: all): the map, and its `Ancestry`.
 
-    In place, row by row: a `take` of the whole map would need a second copy of it.
+    In place, row by row: a `take` of the map would need a second copy of it.
     """
     behind = (ancestry.chain != CURRENT) & wanted
     slots, count = jnp.nonzero(behind, size=len(behind), fill_value=0)[0], behind.sum()
@@ -61,46 +60,46 @@ def apply_ancestry(world, ancestry, wanted, config):
 
 
 def _apply(world, ancestry, slots, count, config):
-    """The map with the first `count` of the slots brought up to date."""
-    # Rows travel between devices some at a time.
-    some = 1 if config.devices == 1 else max(1, min(8, TOGETHER // config.particles))
+    """The map with the first `count` of the slots resampled."""
+    # Devices exchange several rows in one message.
+    size = 1 if config.devices == 1 else max(1, min(8, TOGETHER // config.particles))
 
-    def update_some(i, world):
-        # Beyond the last comes the last again, which does no harm: all are read before any is put.
-        at = [slots[jnp.minimum(i * some + j, count - 1)] for j in range(some)]
+    def update_rows(i, world):
+        # The last may come again, which does no harm: all are read before any is written.
+        at = [slots[jnp.minimum(i * size + j, count - 1)] for j in range(size)]
         rows = [jax.tree.map(partial(_row, slot=slot), world) for slot in at]
         indices = [_index(ancestry, slot, config) for slot in at]
         for slot, new in zip(at, sharding.gather(rows, indices, config), strict=True):
             world = jax.tree.map(partial(_put, slot=slot), world, new)
         return world
 
-    return repeat(-(-count // some), update_some, world)
+    return repeat(-(-count // size), update_rows, world)
 
 
 def _apply_near(world, ancestry, slots, count, config):
-    """`_updated` where the neighbours' borders are all that a device needs of others."""
-    some = max(1, min(8, TOGETHER // (2 * halo_exchange.width(config))))
+    """`_apply` where a device needs no more of others than its neighbours' halos."""
+    size = max(1, min(8, TOGETHER // (2 * halo_exchange.width(config))))
 
-    def update_some(i, world):
-        first = i * some
-        at = [slots[jnp.minimum(first + j, count - 1)] for j in range(some)]
-        border = halo_exchange.exchange_halos(world, at, config)
+    def update_rows(i, world):
+        first = i * size
+        at = [slots[jnp.minimum(first + j, count - 1)] for j in range(size)]
+        halos = halo_exchange.exchange_halos(world, at, config)
 
         def update_one(j, world):
             slot = slots[first + j]
-            taken = partial(
+            gather_row = partial(
                 halo_exchange.gather_row, slot=slot, index=_index(ancestry, slot, config)
             )
-            side = jax.tree.map(partial(_row, slot=j), border)
-            return jax.tree.map(partial(taken, config=config), world, side)
+            side = jax.tree.map(partial(_row, slot=j), halos)
+            return jax.tree.map(partial(gather_row, config=config), world, side)
 
-        return repeat(jnp.minimum(some, count - first), update_one, world)
+        return repeat(jnp.minimum(size, count - first), update_one, world)
 
-    return repeat(-(-count // some), update_some, world)
+    return repeat(-(-count // size), update_rows, world)
 
 
 def _index(ancestry, slot, config):
-    """Where what a device's particles have in a slot is, among all particles."""
+    """Ancestors of the device's particles in a slot, among all particles."""
     return sharding.local_shard(_row(ancestry.chains, ancestry.chain[slot]), config)
 
 
@@ -113,7 +112,7 @@ def _put(leaf, new, slot):
 
 
 def oldest_slots(ancestry):
-    """Slots [M] of the oldest chain, if all chains are in use: they are due before resampling."""
+    """Slots [M] of the oldest chain if all chains are in use: due before the next resampling."""
     used = _used(ancestry)
     return used.all() & (ancestry.chain == jnp.argmin(ancestry.begun))
 
@@ -123,9 +122,9 @@ def _used(ancestry):
 
 
 def compose(ancestry, ancestors, wanted):
-    """`Ancestry` of particles that continue `ancestors` [N] if resampling was `wanted`.
+    """Compose the chains with `ancestors` [N] if resampling was `wanted`.
 
-    There must be a chain that is not in use (`last_of`).
+    There must be a chain that is not in use (see `oldest_slots`).
     """
     used = _used(ancestry)
     free = jnp.argmin(used).astype(jnp.int32)

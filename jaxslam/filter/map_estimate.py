@@ -1,4 +1,4 @@
-"""The map as users read it: landmarks of all particles as Cartesian means and covariances."""
+"""Estimate of the map over all particles: Cartesian means and covariances of landmarks."""
 
 from functools import partial
 from typing import NamedTuple
@@ -12,8 +12,8 @@ from jaxslam.models import geometry
 
 
 class LandmarkTable(NamedTuple):
-    """One map for all particles, M slots: world `mean` [2, M], `cov` [3, M], `count`, `landmark_id`, and
-    whether the slot is `kept`: occupied, confirmed, and of known depth."""
+    """One map for all particles, in M slots: world `mean` [2, M] (m), `cov` [3, M] (xx, xy, yy),
+    `count`, `landmark_id`, and whether it is `kept`: occupied, confirmed, and of known depth."""
 
     mean: jax.Array
     cov: jax.Array
@@ -24,9 +24,9 @@ class LandmarkTable(NamedTuple):
 
 @partial(jax.jit, static_argnames="config")
 def summarise(world, weight, best, params, config):
-    """The map of particle `best`, each landmark averaged over the particles that share its birth.
+    """`LandmarkTable` of particle `best`, each landmark averaged over all particles that hold it.
 
-    The covariance is the mixture's: the mean of the particles' own, and the spread of their means.
+    The covariance is the mixture's: the mean of the particles' own, plus the spread of their means.
     """
     shared = sharding.replicated((best, params))
     specs = sharding.particle_sharded(world), sharding.particle_sharded(weight), *shared
@@ -35,21 +35,21 @@ def summarise(world, weight, best, params, config):
 
 
 def _summarise(world, weight, best, params, config):
-    mine = sharding.select_particle(world, best, config)
-    centre, _, depth_known = to_world(config.sensor, mine)
-    confirmed = True if mine.log_odds is None else mine.log_odds >= params.existence_confirm
+    best_map = sharding.select_particle(world, best, config)
+    centre, _, depth_known = to_world(config.sensor, best_map)
+    confirmed = True if best_map.log_odds is None else best_map.log_odds >= params.existence_confirm
 
-    slots, lane = jnp.arange(len(mine.landmark_id)), jnp.arange(len(weight))
+    slots, lane = jnp.arange(len(best_map.landmark_id)), jnp.arange(len(weight))
 
-    def one(landmark_id, centre):
-        # Births of one frame may be in other slots where a particle had more of them.
+    def average(landmark_id, centre):
+        # New landmarks of one frame may be in other slots where a particle had more of them.
         same = (world.landmark_id == landmark_id) & (world.count > 0)
         at = jnp.where(same, slots[:, None], -1).max(0)
         row = jax.tree.map(lambda leaf: leaf[..., jnp.maximum(at, 0), lane], world)
         row, share = sharding.all_gather((row, weight * (at >= 0)), config)
         point, cov, known = to_world(config.sensor, row)
         share = jnp.where(known, share, 0)
-        # Pinned: joined with what comes before, sums would be rounded by the number of devices.
+        # A barrier: fused with what precedes, sums would be rounded by the number of devices.
         share = barrier(share / barrier(share).sum())
         dx, dy = (jnp.where(known, p - c, 0) for p, c in zip(point, centre, strict=True))
         mx, my = barrier(jnp.stack([share * dx, share * dy])).sum(1)
@@ -60,13 +60,15 @@ def _summarise(world, weight, best, params, config):
         ]
         return jnp.stack([centre[0] + mx, centre[1] + my]), barrier(jnp.stack(parts)).sum(1)
 
-    mean, cov = jax.lax.map(lambda args: one(*args), (mine.landmark_id, jnp.stack(centre, -1)))
-    kept = (mine.count > 0) & confirmed & depth_known
-    return LandmarkTable(mean.T, cov.T, mine.count, mine.landmark_id, kept)
+    mean, cov = jax.lax.map(
+        lambda args: average(*args), (best_map.landmark_id, jnp.stack(centre, -1))
+    )
+    kept = (best_map.count > 0) & confirmed & depth_known
+    return LandmarkTable(mean.T, cov.T, best_map.count, best_map.landmark_id, kept)
 
 
 def to_world(sensor, world):
-    """World point (x, y), covariance (xx, xy, yy) and whether its depth is known, of every slot.
+    """World points (x, y), covariances (xx, xy, yy) and whether depths are known, of every slot.
 
     An inverse depth counts as known when it is three standard deviations from zero.
     """

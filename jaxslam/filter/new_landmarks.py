@@ -1,7 +1,7 @@
-"""New landmarks, and maps given from the start.
+"""Create new landmarks, and maps given at the start.
 
-A particle's births of a frame take slots that no particle uses, the lowest first. So what all
-particles see for the first time goes to one slot in all of them, and a slot stays about one place.
+New landmarks take slots that no particle uses, the lowest first: what all particles begin goes to
+the same slot in all of them.
 """
 
 import jax
@@ -12,7 +12,7 @@ from jaxslam.filter.landmarks import Landmarks
 from jaxslam.filter.xla import barrier, nonzero_indices
 from jaxslam.models import sensors
 
-AT_ONCE = 16
+AT_ONCE = 16  # particles served by one round
 
 
 def occupied(world):
@@ -21,15 +21,15 @@ def occupied(world):
 
 
 def create(config, world, start, sensor_pose, match, free, measurements, params, step_number):
-    """The map with a landmark for every measurement that the n particles from `start` on matched as
-    new; slots [M] in which that was; and how many were lost [n], for want of a slot.
+    """Create a landmark for every measurement that the n particles from `start` on match as `NEW`:
+    the map, the slots [M] with new landmarks, and how many were lost [n] because none was free.
 
-    A particle's births go to `free` [K] in the measurements' order (beyond the map: none left).
-    With known identities identity i takes slot i. Births are rare, and of few particles: each round
-    serves all of `AT_ONCE` particles.
+    A particle's new landmarks go to `free` [K] in the measurements' order (beyond the map: none
+    left); identity i takes slot i. They are rare, and of few particles: each round serves `AT_ONCE`
+    particles.
     """
     total, slots, width = len(match), world.count.shape[0], match.shape[1]
-    slot, lanes, count, touched, lost = jax.lax.cond(
+    slot, particles, count, touched, lost = jax.lax.cond(
         (match == NEW).any(),
         lambda *given: _plan(config, slots, *given),
         lambda *given: jax.tree.map(
@@ -47,28 +47,28 @@ def create(config, world, start, sensor_pose, match, free, measurements, params,
 
     def some(carry):
         i, world = carry
-        lane = jax.lax.dynamic_slice_in_dim(lanes, i * AT_ONCE, AT_ONCE)
-        there, lane = lane < width, jnp.minimum(lane, width - 1)
-        to = jnp.where(there, slot[:, lane], slots)  # beyond: dropped
-        # Arrays of their own: fused, what rounds them would depend on the shape of the block.
-        here = barrier(tuple(part[lane] for part in sensor_pose))
+        particle = jax.lax.dynamic_slice_in_dim(particles, i * AT_ONCE, AT_ONCE)
+        there, particle = particle < width, jnp.minimum(particle, width - 1)
+        to = jnp.where(there, slot[:, particle], slots)  # beyond: dropped
+        # A barrier: fused, their rounding would depend on the shape of the block.
+        here = barrier(tuple(part[particle] for part in sensor_pose))
         mean, factor, anchor = sensors.locate(config.sensor, here, value, cov, params)
 
-        def whole(parts):
+        def broadcast(parts):
             return jnp.stack([jnp.broadcast_to(part, to.shape) for part in parts])
 
         fresh = Landmarks(
-            mean=whole(mean),
-            factor=whole(factor),
-            anchor=None if world.anchor is None else whole(anchor),
+            mean=broadcast(mean),
+            factor=broadcast(factor),
+            anchor=None if world.anchor is None else broadcast(anchor),
             log_odds=odds if forgetting else None,
-            # With odds against it from the start it is forgotten at once.
+            # With negative log-odds from the start it is forgotten at once.
             count=(odds >= 0).astype(jnp.int32) if forgetting else 1,
             landmark_id=jnp.broadcast_to(landmark_id, to.shape),
         )
 
         def put(leaf, new):
-            return leaf.at[..., to, start + lane].set(new, mode="drop", unique_indices=True)
+            return leaf.at[..., to, start + particle].set(new, mode="drop", unique_indices=True)
 
         return i + 1, jax.tree.map(put, world, fresh)
 
@@ -77,8 +77,8 @@ def create(config, world, start, sensor_pose, match, free, measurements, params,
 
 
 def _plan(config, slots, match, free, identity):
-    """Where births go: slots [K, n]; the particles that have any, listed, and how many; slots [M]
-    in which there is one; and how many find none [n]."""
+    """Slots [K, n] of new landmarks; indices of the particles that have any, and how many; whether
+    a slot gets one [M]; and how many get no slot [n]."""
     new = match == NEW
     if config.association == "known":
         some = new.any(0)
@@ -87,22 +87,23 @@ def _plan(config, slots, match, free, identity):
         slot = slot[:, None]
     else:
         total = len(match)
-        nth = jnp.tril(jnp.ones((total, total), jnp.float32)) @ new.astype(jnp.float32)
-        nth = nth.astype(jnp.int32)
-        some = nth[-1] > 0
-        taken = jnp.where(jnp.arange(total) < nth[-1].max(), free, slots)
-        slot = free[jnp.maximum(nth - 1, 0)]
+        rank = jnp.tril(jnp.ones((total, total), jnp.float32)) @ new.astype(jnp.float32)
+        rank = rank.astype(jnp.int32)
+        some = rank[-1] > 0
+        taken = jnp.where(jnp.arange(total) < rank[-1].max(), free, slots)
+        slot = free[jnp.maximum(rank - 1, 0)]
     slot = jnp.where(new, slot, slots).astype(jnp.int32)
-    lanes, count = nonzero_indices(some)
-    lanes = jnp.pad(lanes, (0, AT_ONCE), constant_values=match.shape[1])
+    particles, count = nonzero_indices(some)
+    particles = jnp.pad(particles, (0, AT_ONCE), constant_values=match.shape[1])
     touched = (taken[:, None] == jnp.arange(slots)).any(0)
-    return slot, lanes, count, touched, (new & (slot >= slots)).sum(0).astype(jnp.int32)
+    return slot, particles, count, touched, (new & (slot >= slots)).sum(0).astype(jnp.int32)
 
 
 def place_given(world, known):
-    """The map with its first slots set to a given one: mean [2, L], factor [3, L] (, anchor).
+    """Place a given map in the first slots: mean [2, L], factor [3, L] (`bearing`: anchor [2, L]).
 
-    A given landmark is certain to exist until it has been seen.
+    A given landmark is certain to exist until it has been seen. Raises `ValueError` where there are
+    fewer slots.
     """
     parts = dict(zip(("mean", "factor", "anchor"), known, strict=False))
     size = jnp.shape(parts["mean"])[1]

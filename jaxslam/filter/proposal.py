@@ -1,10 +1,10 @@
 """The informed proposal of FastSLAM 2.0: the pose is drawn from motion times measurements.
 
 (Montemerlo, Thrun, Koller and Wegbreit 2003.) The motion model turns three standard normals u into
-a pose (`motion.sample`). So here the pose's uncertainty is that of u: N(0, I) before the frame, and
-every measurement associated is one linear update of it, in square-root form. Whatever the noise,
-nothing has to be inverted, and zero noise in a direction leaves it alone. The normal that comes out
-is only a proposal: what it gets wrong, linearised as it is, the weights put right.
+a pose (`motion.sample`). So the pose's uncertainty is here that of u: N(0, I) before the frame, and
+every matched measurement is one linear update of it, in square-root form: nothing has to be
+inverted, whatever the noise, and a direction without noise stays fixed. The linearised posterior is
+only a proposal; the weights correct for its error.
 """
 
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from jaxslam.models.geometry import wrap
 
 
 class Whitened(NamedTuple):
-    """Normal of u: `mean` (3), `root` (3 rows of 3; not triangular), `log_det` of the root."""
+    """Normal density of u: `mean` (3), `root` (3 rows of 3, not triangular), `log_det` of root."""
 
     mean: tuple
     root: tuple
@@ -30,7 +30,7 @@ def motion_axes(before, predicted, sensor_pose, odometry, params):
 
     `before`, `predicted`: the robot's poses, of which the second is `motion.sample`'s at u = 0.
     """
-    swing = predicted[1] - sensor_pose[1], sensor_pose[0] - predicted[0]  # as the robot turns
+    swing = predicted[1] - sensor_pose[1], sensor_pose[0] - predicted[0]  # by the robot's turning
     return [
         (x + swing[0] * turn, y + swing[1] * turn, turn)
         for x, y, turn in motion.axes(before, odometry, params)
@@ -59,51 +59,53 @@ def pose_jacobian(sensor, sensor_pose, axes, mean, anchor, value):
 
 
 def inform(sensor, sensor_pose, axes, world, match, measurements, params):
-    """`Whitened` of n particles after the frame's matched measurements, in their order.
+    """Update N(0, I) of u by the matched measurements [K, n], in their order: `Whitened`.
 
-    `match` [K, n], `world` the map before the frame, `params` with the noise of updates. A
-    landmark's own uncertainty counts as noise of its measurement.
+    `world`: the map before the frame. `params`: with the noise of updates. A landmark's uncertainty
+    counts as noise of its measurement.
     """
-    lane, one = jnp.arange(match.shape[1]), jnp.ones_like(sensor_pose[0])
+    particle, one = jnp.arange(match.shape[1]), jnp.ones_like(sensor_pose[0])
     zero = jnp.zeros_like(one)
     start = Whitened((zero,) * 3, ((one, zero, zero), (zero, one, zero), (zero, zero, one)), zero)
 
     def step(k, whitened):
         matched = match[k] >= 0
         slot = jnp.where(matched, match[k], 0)
-        mean, factor = tuple(world.mean[:, slot, lane]), tuple(world.factor[:, slot, lane])
-        anchor = None if world.anchor is None else tuple(world.anchor[:, slot, lane])
-        seen = sensors.observe(sensor, sensor_pose, mean, anchor, params)
-        by_u = pose_jacobian(sensor, sensor_pose, axes, mean, anchor, seen.value)
+        mean, factor = tuple(world.mean[:, slot, particle]), tuple(world.factor[:, slot, particle])
+        anchor = None if world.anchor is None else tuple(world.anchor[:, slot, particle])
+        prediction = sensors.observe(sensor, sensor_pose, mean, anchor, params)
+        jacobian = pose_jacobian(sensor, sensor_pose, axes, mean, anchor, prediction.value)
         value, cov = measurements.value[k], measurements.cov[k]
-        for h, rest, variance in _independent(sensor, seen, factor, by_u, value, cov, params):
-            whitened = _update(whitened, h, rest, variance, matched)
+        for h, innovation, variance in _independent(
+            sensor, prediction, factor, jacobian, value, cov, params
+        ):
+            whitened = _update(whitened, h, innovation, variance, matched)
         return whitened
 
     return jax.lax.fori_loop(0, match.shape[0], step, start)
 
 
-def _independent(sensor, seen, factor, by_u, value, cov, params):
-    """Independent scalars (row by u, innovation, variance) of one measurement."""
-    spread = [geometry.transpose_times(factor, row) for row in seen.rows]
-    v0 = value[0] - seen.value[0]
+def _independent(sensor, prediction, factor, jacobian, value, cov, params):
+    """Split a measurement into independent scalars: (row by u, innovation, variance) of each."""
+    spread = [geometry.transpose_times(factor, row) for row in prediction.rows]
+    v0 = value[0] - prediction.value[0]
     if sensor == "bearing":
         shift, extra = landmarks.turn_factor(
-            spread[0], geometry.transpose_times(factor, seen.stretch)
+            spread[0], geometry.transpose_times(factor, prediction.stretch)
         )
-        s00 = spread[0][0] ** 2 + spread[0][1] ** 2 + extra + seen.noise[0]
-        return [(by_u[0], wrap(v0 - shift), s00)]
-    v1 = value[1] - seen.value[1]
+        s00 = spread[0][0] ** 2 + spread[0][1] ** 2 + extra + prediction.noise[0]
+        return [(jacobian[0], wrap(v0 - shift), s00)]
+    v1 = value[1] - prediction.value[1]
     if sensor == "position":
         xx, xy, yy = (component * params.position_scale**2 for component in cov)
     else:
-        (xx, yy), xy, v1 = seen.noise, 0.0, wrap(v1)
+        (xx, yy), xy, v1 = prediction.noise, 0.0, wrap(v1)
     s00 = spread[0][0] ** 2 + spread[0][1] ** 2 + xx
     s01 = spread[0][0] * spread[1][0] + spread[0][1] * spread[1][1] + xy
     s11 = spread[1][0] ** 2 + spread[1][1] ** 2 + yy
     share = s01 / s00
-    rest = tuple(b - share * a for a, b in zip(*by_u, strict=True))
-    return [(by_u[0], v0, s00), (rest, v1 - share * v0, s11 - share * s01)]
+    rest = tuple(b - share * a for a, b in zip(*jacobian, strict=True))
+    return [(jacobian[0], v0, s00), (rest, v1 - share * v0, s11 - share * s01)]
 
 
 def _update(whitened, h, innovation, variance, matched):
@@ -131,7 +133,7 @@ def _update(whitened, h, innovation, variance, matched):
 
 
 def draw(whitened, normals):
-    """u [3, n] for standard normals [3, n], and log of motion over proposal at it.
+    """Draw u [3, n] with standard normals [3, n]; also the log of motion over proposal there.
 
     u = mean + root n has log density -|n|^2 / 2 - log det root; the motion's is -|u|^2 / 2.
     """

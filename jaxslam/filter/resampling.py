@@ -5,13 +5,13 @@ import jax.numpy as jnp
 
 from jaxslam.filter import sharding
 
-AT_ONCE = 4096  # elements: a round of a loop costs as much as some hundred of them
+AT_ONCE = 4096  # elements: a round of a loop costs as much as several hundred of them
 
 
 def systematic(log_weight, uniform):
-    """Ancestors [N] (int32) for log weights [N] and one uniform draw in [0, 1).
+    """Draw ancestors [N] (int32) for log weights [N] with one uniform in [0, 1).
 
-    Particle j is chosen N w_j times, rounded up or down; one of weight zero never is.
+    Particle j is drawn N w_j times, rounded up or down; never if its weight is zero.
     """
     n = len(log_weight)
     weight = jnp.exp(log_weight - log_weight.max())
@@ -31,15 +31,15 @@ def systematic(log_weight, uniform):
 
 
 def gather(tree, ancestors, wanted, config):
-    """Every leaf [..., N] with its last axis taken at `ancestors`, if `wanted`.
+    """Gather every leaf [.., N] at `ancestors` along its last axis, if `wanted`.
 
-    A few rows at a time and in place: they fit the cache, while a whole `take` would need a second
-    copy of the map and run at a fraction of the speed. Unwanted is a loop of no rounds, where a
-    `cond` would copy the map. A device has its share of the leaves.
+    A few rows at a time and in place: they fit the cache, while one `take` would need a second copy
+    of the map and run at a fraction of the speed. If not wanted, the loop has no rounds, where a
+    `cond` would copy the map. On several devices leaves are the device's own.
     """
     ancestors = sharding.local_shard(ancestors, config)
 
-    def one(i, parts):
+    def gather_part(i, parts):
         part = jax.lax.dynamic_index_in_dim(parts, i, keepdims=False)
         (part,) = sharding.gather([part], [ancestors], config)
         return jax.lax.dynamic_update_index_in_dim(parts, part, i, 0)
@@ -48,10 +48,10 @@ def gather(tree, ancestors, wanted, config):
         if leaf.size == 0:
             return leaf
         rows = leaf.size // leaf.shape[-1]
-        some = max(1, min(rows, AT_ONCE // leaf.shape[-1]))
-        some = next(size for size in range(some, 0, -1) if rows % size == 0)
-        parts = leaf.reshape(-1, some, leaf.shape[-1])
+        most = max(1, min(rows, AT_ONCE // leaf.shape[-1]))
+        size = next(size for size in range(most, 0, -1) if rows % size == 0)
+        parts = leaf.reshape(-1, size, leaf.shape[-1])
         rounds = jnp.where(wanted, len(parts), 0)
-        return jax.lax.fori_loop(0, rounds, one, parts).reshape(leaf.shape)
+        return jax.lax.fori_loop(0, rounds, gather_part, parts).reshape(leaf.shape)
 
     return jax.tree.map(gather_leaf, tree)

@@ -1,9 +1,9 @@
-"""Particles shared evenly by several devices, of one process or of several.
+"""Sharding of particles over several devices, of one process or of several.
 
 Each device moves, associates and updates its own particles. What concerns all (weights, ancestors,
-bounds) is worked out on every device from the same numbers in the same order, so that the result
-is that of one device, bit for bit. Only log weights, poses and, of the landmarks that are about
-to be looked at, what is needed of others travel (`borders`).
+bounds) is computed on every device from the same numbers in the same order, so that the result is
+that of one device, bit for bit. Only log weights, poses, and landmarks of other devices that are
+needed in candidate slots are sent (`halo_exchange`).
 """
 
 from functools import partial
@@ -17,19 +17,19 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from jaxslam.filter.xla import barrier
 
 AXIS = "particles"
-ALL = PartitionSpec()  # the same on every device
-PIECE = 2**26  # bytes of an array that all devices get at once
+ALL = PartitionSpec()  # replicated
+PIECE = 2**26  # bytes of an array that are replicated at once
 
 
 def mesh(config):
-    """The devices that share the particles; raises `ValueError` where there are not as many."""
+    """Mesh of the devices that share the particles; raises `ValueError` if there are too few."""
     return mesh_of(config.devices)
 
 
 def mesh_of(count):
-    """So many devices in a row; raises `ValueError` where there are not as many."""
+    """Mesh of `count` devices; raises `ValueError` if there are too few."""
     processes = jax.process_count()
-    # Each process has as many of them.
+    # Every process has the same number of them.
     share = -(-count // processes)
     found = [jax.local_devices(i)[:share] for i in range(processes)]
     found = [device for part in found for device in part]
@@ -43,10 +43,9 @@ def mesh_of(count):
 
 
 def to_host(leaf):
-    """A whole array on this host; every process that shares it must ask, and gets it.
+    """Copy an array to this host; all processes that share it must call this, and get it.
 
-    On a CPU it may be the device's own memory: not to be kept, or the device could not work on it
-    in place.
+    On a CPU it may be the device's memory: do not keep it, or the device cannot work in place.
     """
     if leaf.is_fully_replicated:
         return np.asarray(leaf)
@@ -67,13 +66,13 @@ def to_host(leaf):
 
 @partial(jax.jit, static_argnames=("some", "sharding"))
 def _rows(leaf, start, some, sharding):
-    """Some rows of an array [..., N], on every device."""
+    """Rows of an array [.., N], replicated."""
     part = jax.lax.dynamic_slice_in_dim(leaf.reshape(-1, leaf.shape[-1]), start, some)
     return jax.lax.with_sharding_constraint(part, sharding)
 
 
 def to_devices(array, shape):
-    """An array on the devices, a copy: of NumPy's, as `shape` (`ShapeDtypeStruct`) says."""
+    """Copy a NumPy array to the devices, sharded as `shape` (`ShapeDtypeStruct`) says."""
     if shape.sharding is None:
         return jnp.array(array)
     return jax.make_array_from_callback(
@@ -82,37 +81,36 @@ def to_devices(array, shape):
 
 
 def broadcast_int(number):
-    """A whole number of process 0, told to all processes; every one of them must ask."""
+    """Broadcast an integer of process 0; all processes must call this."""
     if jax.process_count() == 1:
         return number
     return int(multihost_utils.broadcast_one_to_all(np.int32(number)))
 
 
 def broadcast(tree):
-    """Arrays of process 0 (the others' count for their shapes), told to all processes; every one of
-    them must ask."""
+    """Broadcast arrays of process 0 (of others only shapes count); all processes must call this."""
     if jax.process_count() == 1:
         return tree
     return jax.tree.map(np.asarray, multihost_utils.broadcast_one_to_all(tree))
 
 
 def is_leader():
-    """Whether this process speaks and writes for all."""
+    """Whether this process prints and writes for all."""
     return jax.process_index() == 0
 
 
 def particle_sharded(tree):
-    """`PartitionSpec` of every leaf [..., N] of a tree: the last axis is shared out."""
+    """`PartitionSpec` of every leaf [.., N] of a tree, sharded on the last axis."""
     return jax.tree.map(lambda leaf: PartitionSpec(*[None] * (leaf.ndim - 1), AXIS), tree)
 
 
 def replicated(tree):
-    """`PartitionSpec` of every leaf of a tree: all of it on each device."""
+    """`PartitionSpec` of every leaf of a tree, replicated."""
     return jax.tree.map(lambda leaf: ALL, tree)
 
 
 def shardings(specs, config):
-    """`NamedSharding`s of a tree of `PartitionSpec`s; None: as it comes."""
+    """`NamedSharding`s of a tree of `PartitionSpec`s; None for one device."""
     if config.devices == 1:
         return None
     over = mesh(config)
@@ -124,17 +122,17 @@ def shardings(specs, config):
 
 
 def shard_map(function, specs, outcome, config):
-    """The function on every device, with its share of the arguments; as it is for one device."""
+    """Map a function over the devices (`jax.shard_map`); unchanged for one device."""
     if config.devices == 1:
         return function
-    # The check does not know that what was gathered is the same everywhere.
+    # The check does not know that gathered arrays are replicated.
     return jax.shard_map(
         function, mesh=mesh(config), in_specs=specs, out_specs=outcome, check_vma=False
     )
 
 
 def all_gather(tree, config):
-    """Leaves [..., N] of all particles, on every device, of leaves [..., n] of its own."""
+    """All-gather leaves [.., n] of the device's particles to [.., N] of all, in few messages."""
     if config.devices == 1:
         return barrier(tree)
     leaves, kind = jax.tree.flatten(tree)
@@ -148,7 +146,7 @@ def all_gather(tree, config):
 
 
 def gather(trees, indices, config):
-    """Of each tree the leaves [..., n] at `indices` [n] of all particles, wherever these are."""
+    """Gather each tree's leaves [.., n] at its `indices` [n] of all particles, on any device."""
     leaves, kind = jax.tree.flatten(trees)
     each, found = len(leaves) // len(indices), list(leaves)
     if config.devices == 1:
@@ -158,7 +156,7 @@ def gather(trees, indices, config):
         return jax.tree.unflatten(kind, found)
     for every, parts in _gather_packed(leaves):
         count, n = every.shape[1:]
-        # Of a particle's first number, in the order that things came in.
+        # Of a particle's first number, in the order of the gathered array.
         first = barrier([index // n * (count * n) + index % n for index in indices])
         for i, begin, end in parts:
             rows = np.arange(begin, end, dtype=np.int32).reshape(leaves[i].shape[:-1])
@@ -168,22 +166,20 @@ def gather(trees, indices, config):
 
 
 def _at(array, rows, index):
-    """Numbers of an array [..., n] at rows [...] and places [n], as if it were one row."""
+    """Numbers of an array [.., n] at rows [..] and `index` [n], as if it were one row."""
     at = rows[..., None] * array.shape[-1] + index
     return array.reshape(-1).at[at].get(mode="promise_in_bounds")
 
 
 def _gather_packed(leaves):
-    """The same leaves [..., n] of all devices, in few large messages (a small one costs as much as
-    some ten thousand numbers): of every width of number an array [devices, rows, n], as it comes,
-    and which rows (leaf, from, to) are whose."""
+    """All-gather leaves [.., n] in few large messages (a small one costs as much as ten thousand
+    numbers): for every item size an array [devices, rows, n], and its rows (leaf, from, to)."""
     for rows, whose in _pack(leaves):
         yield jax.lax.all_gather(rows, AXIS), whose
 
 
 def _pack(leaves):
-    """Of every width of number an array [rows, n] of the leaves [..., n], and whose rows are whose
-    (leaf, from, to)."""
+    """Pack leaves [.., n] of one item size into an array [rows, n]; with its (leaf, from, to)."""
     n = leaves[0].shape[-1]
     for size in sorted({leaf.dtype.itemsize for leaf in leaves}):
         number = {4: jnp.uint32, 8: jnp.uint64}[size]
@@ -194,8 +190,8 @@ def _pack(leaves):
 
 
 def exchange_with_neighbours(leaves, b, config):
-    """Of leaves [..., 2 b], every device's first and last b: the last of the device before, and the
-    first of the one after it (zeros where there is none)."""
+    """Exchange leaves [.., 2 b], a device's first and last b: returns the last b of the device
+    before and the first b of the device after (zeros where there is none)."""
     found, pairs = list(leaves), range(config.devices - 1)
     for rows, whose in _pack(leaves):
         before = jax.lax.ppermute(rows[:, b:], AXIS, [(i, i + 1) for i in pairs])
@@ -208,7 +204,7 @@ def exchange_with_neighbours(leaves, b, config):
 
 
 def local_shard(tree, config):
-    """Leaves [..., n] of a device's own particles, of leaves [..., N] of all."""
+    """Leaves [.., n] of the device's own particles, of leaves [.., N] of all."""
     if config.devices == 1:
         return tree
     n = config.particles // config.devices
@@ -219,35 +215,35 @@ def local_shard(tree, config):
 
 
 def all_min(values, config):
-    """The least of the devices' values, each for itself; what is not a number stays."""
+    """Elementwise minimum over the devices; NaN stays."""
     if config.devices == 1:
         return values
     return jax.lax.all_gather(values, AXIS).min(0)
 
 
 def all_sum(counts, config):
-    """Sum of whole numbers over the devices."""
+    """Sum of integers over the devices."""
     return counts if config.devices == 1 else jax.lax.psum(counts, AXIS)
 
 
 def select_particle(tree, lane, config):
-    """Leaves [...] of one particle of all, of leaves [..., n] of a device's own."""
+    """Leaves [..] of one particle of all, of leaves [.., n] of the device's own."""
     if config.devices == 1:
         return jax.tree.map(lambda leaf: leaf[..., lane], tree)
     holder, at = jnp.divmod(lane, config.particles // config.devices)
     return jax.tree.map(lambda leaf: jax.lax.all_gather(leaf[..., at], AXIS)[holder], tree)
 
 
-def map_over_devices(one, items, count):
-    """`one` of every item (first axis), shared out over so many devices; on each, one at a time."""
+def map_over_devices(function, items, count):
+    """Map a function over items (first axis), sharded over `count` devices, in turn on each."""
     total = len(jax.tree.leaves(items)[0])
     if count == 1 or total == 1:
-        return jax.lax.map(one, items)
-    # Filled up with the first ones, so that all devices have as many.
+        return jax.lax.map(function, items)
+    # Filled up with the first items, so that all devices have equally many.
     index = np.arange(-(-total // count) * count) % total
     share = PartitionSpec(AXIS)
     mapped = jax.shard_map(
-        lambda part: jax.lax.map(one, part),
+        lambda part: jax.lax.map(function, part),
         mesh=mesh_of(count), in_specs=share, out_specs=share, check_vma=False,
     )  # fmt: skip
     found = mapped(jax.tree.map(lambda leaf: leaf[index], items))

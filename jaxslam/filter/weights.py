@@ -1,4 +1,4 @@
-"""Weights of all particles: normalised, and what they say of the pose."""
+"""Weights of all particles: normalise them, estimate the pose."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from jaxslam.models.geometry import wrap
 
 
 class Estimate(NamedTuple):
-    """Mean pose [3], its covariance [3, 3], and the particle of greatest weight."""
+    """`mean` pose [3] (m, m, rad), its `cov` [3, 3], and the `best` (heaviest) particle."""
 
     mean: jax.Array
     cov: jax.Array
@@ -18,10 +18,11 @@ class Estimate(NamedTuple):
 
 
 def weigh(log_weight, density):
-    """Normalised log weights, log evidence of the step, and flags (non-finite, degenerate)."""
+    """Weigh particles by log densities [N] (eq. 5): normalised log weights, log evidence, and
+    (number of new non-finite weights, whether none was finite)."""
     raw = barrier(log_weight + density)
     finite = jnp.isfinite(raw)
-    # A particle that already had no weight is not news.
+    # A particle that had no weight before is not counted again.
     nonfinite = jnp.sum(~finite & (log_weight > -jnp.inf))
     degenerate = ~finite.any()
     log_evidence = jax.nn.logsumexp(jnp.where(finite, raw, -jnp.inf))
@@ -32,7 +33,7 @@ def weigh(log_weight, density):
 
 
 def estimate_pose(pose, weight):
-    """Weighted mean (circular in heading) and covariance of the poses, and the heaviest one."""
+    """`Estimate` from poses [3, N] and weights [N]; the mean heading is circular."""
     # Sums, not matrix products: how these add up depends on the number of threads.
     x, y, heading = pose
     parts = jnp.stack([x, y, jnp.sin(heading), jnp.cos(heading)])

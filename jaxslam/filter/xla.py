@@ -1,4 +1,4 @@
-"""Where masks are true, and loops over as many, fast on a CPU; sums in order, work done once."""
+"""Primitives that XLA compiles well on a CPU and rounds the same for every shape."""
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +8,8 @@ WIDTH = 32
 
 
 def nonzero_indices(mask, size=None):
-    """Indices [size] (int32; None: all that could be) where a mask [n] is true, in order, and how
-    many there are; the rest is n.
+    """Indices [size] (int32; None: n) where a mask [n] is true, in order, padded with n; and how
+    many there are.
 
     `jnp.nonzero` takes two cumulative sums and a histogram, which cost a block of particles more
     than its arithmetic; here sums are products with triangles of ones, exact below 2**24.
@@ -28,7 +28,7 @@ def nonzero_indices(mask, size=None):
 
 
 def repeat(count, body, start):
-    """`jax.lax.fori_loop` from 0 to a count worked out."""
+    """`jax.lax.fori_loop` from 0 to a computed count."""
     return jax.lax.while_loop(
         lambda carry: carry[0] < count, lambda carry: (carry[0] + 1, body(*carry)), (0, start)
     )[1]
@@ -46,20 +46,19 @@ def ordered_sum(rows):
 
 
 def barrier(tree):
-    """The same arrays, made where this stands and nowhere else.
+    """`jax.lax.optimization_barrier`: compute the arrays here and nowhere else.
 
-    XLA works cheap things out anew in each fusion that uses them, and joins other products and
-    sums there into one rounding.
+    XLA repeats cheap arithmetic in each fusion that uses it, and contracts products and sums there
+    into one rounding.
     """
     return jax.lax.optimization_barrier(tree)
 
 
-def compute_once(sure, work):
-    """What `work` returns, as arrays: a branch ends fusion. `sure` is true, but not so that XLA can
-    tell.
+def compute_once(true, work):
+    """Compute what `work` returns in a branch, which ends fusion; `true` is so, unknown to XLA.
 
     Else XLA repeats all arithmetic that it takes for cheap (normals, bearings) in everything that
-    is worked out from it, and where that is a concatenation does it one number at a time.
+    depends on it, and in a concatenation one number at a time.
     """
 
     def never():
@@ -67,11 +66,11 @@ def compute_once(sure, work):
             lambda part: jnp.full(part.shape, jnp.nan, part.dtype), jax.eval_shape(work)
         )
 
-    return jax.lax.cond(sure, work, never)
+    return jax.lax.cond(true, work, never)
 
 
 def row_start(leaf, slot, start, *before):
-    """Where a slot's row begins, at places `before` (0: all); indices of one type, also in double
-    precision."""
+    """Start indices of a slot's row, after leading indices `before` (none: all); int32, also in
+    double precision."""
     before = before or (0,) * (leaf.ndim - 2)
     return tuple(jnp.asarray(i, jnp.int32) for i in (*before, slot, start))

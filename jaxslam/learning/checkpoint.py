@@ -1,4 +1,4 @@
-"""Checkpoints of a fit."""
+"""Checkpoint files of a fit."""
 
 import hashlib
 import json
@@ -15,9 +15,9 @@ from jaxslam.parameters import FORMER_NAMES
 
 
 def fingerprint_of(settings, data):
-    """Digest of what a checkpoint belongs to: settings and logs.
+    """Digest the settings and logs that a checkpoint belongs to.
 
-    The settings' text is the one of version 0.1, whose checkpoints can still be resumed.
+    Settings are written as in version 0.1, whose checkpoints can still be resumed.
     """
     text = repr(settings).replace(type(settings).__name__, "_Told", 1)
     for former, name in (FORMER_NAMES | FORMER_FIELDS).items():
@@ -29,10 +29,10 @@ def fingerprint_of(settings, data):
 
 
 def save_state(path, fingerprint, state):
-    """Write the state, all or nothing."""
+    """Write the state atomically."""
     leaves = jax.tree.leaves(state.optimiser)
-    told = {"rows": state.rows, "judgements": state.judgements, "stopped": state.stopped}
-    text = json.dumps(told, default=lambda array: array.tolist())
+    record = {"rows": state.rows, "judgements": state.judgements, "stopped": state.stopped}
+    text = json.dumps(record, default=lambda array: array.tolist())
     arrays = {f"optimiser{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
     with atomic_write(Path(path)) as file:
         np.savez(
@@ -41,28 +41,28 @@ def save_state(path, fingerprint, state):
 
 
 def load_state(path, fingerprint, state):
-    """The state of a checkpoint. Raises `ValueError` if it is none, or of another fit."""
+    """Read the state; raises `ValueError` for no checkpoint, or one of another fit."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            found = dict(file)
+            entries = dict(file)
     except FileNotFoundError:
         raise ValueError(f"{path}: no checkpoint to resume from") from None
     except (OSError, ValueError, zipfile.BadZipFile) as err:
         raise ValueError(f"{path}: not a checkpoint, or damaged: {err}") from err
-    if "fingerprint" not in found or str(found["fingerprint"]) != fingerprint:
+    if "fingerprint" not in entries or str(entries["fingerprint"]) != fingerprint:
         raise ValueError(f"{path}: belongs to a fit of other logs or settings; start without it")
     shape = jax.tree.structure(state.optimiser)
-    leaves = [jnp.asarray(found[f"optimiser{i}"]) for i in range(shape.num_leaves)]
-    told = json.loads(str(found["told"]))
+    leaves = [jnp.asarray(entries[f"optimiser{i}"]) for i in range(shape.num_leaves)]
+    record = json.loads(str(entries["told"]))
     rows, judgements = (
-        tuple(tuple(np.array(v) if isinstance(v, list) else v for v in row) for row in told[name])
+        tuple(tuple(np.array(v) if isinstance(v, list) else v for v in row) for row in record[name])
         for name in ("rows", "judgements")
     )
     return type(state)(
-        step=int(found["step"]),
-        free=found["free"],
+        step=int(entries["step"]),
+        free=entries["free"],
         optimiser=jax.tree.unflatten(shape, leaves),
         rows=rows,
         judgements=judgements,
-        stopped=told["stopped"],
+        stopped=record["stopped"],
     )

@@ -12,18 +12,22 @@ after theirs began to fall.
 """
 
 import time
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 
+from jaxslam.config import Config
 from jaxslam.filter import sharding
 from jaxslam.learning import likelihood
 from jaxslam.learning.checkpoint import fingerprint_of, load_state, save_state
 from jaxslam.learning.transforms import free_vector, from_free, to_free, to_params, with_free
+from jaxslam.logs.log import Log
 from jaxslam.parameter_file import validate
 from jaxslam.parameters import TABLE, Params
 
@@ -84,8 +88,8 @@ def stack_logs(logs, config, params):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *made)
 
 
-@partial(jax.jit, static_argnames=("config", "names", "estimator"))
-def scores(free, params, data, which, keys, config, names, discount, estimator="fisher"):
+@partial(jax.jit, static_argnames=("config", "names"))
+def scores(free, params, data, which, keys, config, names, discount):
     """`likelihood.Score` of items [I]: log `which` [I] of `data` with `keys` [I], at `free` [P] or,
     one for each, [I, P]; derivatives on the free scale. Spread over all devices, one after another
     on each."""
@@ -98,7 +102,7 @@ def scores(free, params, data, which, keys, config, names, discount, estimator="
         if not names:
             value = likelihood.value(given, mine, key, config)
             return likelihood.Score(jnp.zeros(0), value, None, None, None)
-        found = likelihood.score_and_value(given, mine, key, config, names, estimator, discount)
+        found = likelihood.score_and_value(given, mine, key, config, names, discount)
         by_free = jax.vmap(jnp.multiply, (-1, 0), -1)
         slope = jnp.stack([jax.grad(partial(from_free, n))(at[i]) for i, n in enumerate(names)])
         return found._replace(total=by_free(found.total, slope), steps=by_free(found.steps, slope))
@@ -136,25 +140,25 @@ class FitSettings(NamedTuple):
 
 
 def fit(
-    logs,
-    config,
-    params,
-    names=None,
-    held_out=(),
-    bounds=None,
-    priors=None,
-    seeds=4,
-    held_out_seeds=8,
-    steps=150,
-    rate=0.1,
-    batch=None,
-    every=10,
-    patience=3,
-    seed=0,
-    checkpoint=None,
-    resume=False,
-    progress=None,
-):
+    logs: Sequence[Log],
+    config: Config,
+    params: Params,
+    names: Sequence[str] | None = None,
+    held_out: Sequence[Log] = (),
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    priors: Mapping[str, tuple[float, float]] | None = None,
+    seeds: int = 4,
+    held_out_seeds: int = 8,
+    steps: int = 150,
+    rate: float = 0.1,
+    batch: int | None = None,
+    every: int = 10,
+    patience: int = 3,
+    seed: int = 0,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
+    progress: Callable[[int, int, dict[str, Any]], None] | None = None,
+) -> Fit:
     """`Fit` of the parameters `names` (None: `default_names`) to a list of `Log`s.
 
     Logs are independent runs, or windows of one; `batch` of them (None: all) and `seeds` seeds of

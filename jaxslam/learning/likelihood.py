@@ -1,20 +1,21 @@
 """The log likelihood of a log under the filter's model, and its derivatives by `Params`.
 
-The filter's evidence estimates the marginal likelihood Z of the measurements. It is a step function
-of the parameters wherever particles are resampled or associations drawn, and differentiating what
-the program computed ("plain") leaves these out: biased, and no better with more particles. Fisher's
-identity asks for something else: the posterior mean of the derivative of log p(path, associations,
-measurements), with path and associations held still ("frozen"). Every particle carries that
-derivative s as it moves, is weighed and resampled; only sensor parameters need derivatives through
-the landmark EKFs. Forward mode: the memory does not grow with the log.
+The filter's evidence estimates the marginal likelihood Z of the measurements. It jumps as a function
+of the parameters wherever particles are resampled or associations drawn; automatic differentiation
+of the filter ignores these jumps and is biased, whatever the number of particles. The score is
+computed by Fisher's identity instead: the posterior mean of the derivative of log p(path,
+associations, measurements), with path and associations fixed ("frozen"). Every particle carries that
+derivative s as it moves, is weighted and resampled; only sensor parameters need derivatives through
+the landmark EKFs. Forward mode: memory does not grow with the log.
 
-The inherited part forgets with a `discount` per step: s tells of ever fewer distinct ancestors, and
-what it adds to the step at hand is mostly noise (Poyiadjis, Doucet and Singh 2011; the discount is
+The inherited s fades by a `discount` per step: it describes ever fewer distinct ancestors, and its
+contribution to the current step is mostly noise (Poyiadjis, Doucet and Singh 2011; the discount is
 that of MOP, Tan, Hooker and Ionides 2024). docs/gradients.md says when to distrust which.
 """
 
 import dataclasses
 import warnings
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -22,16 +23,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.config import Config
 from jaxslam.filter import blocks, resampling
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.association import CLUTTER, NEW
 from jaxslam.filter.frames import frames_from_log
+from jaxslam.logs.log import Log
 from jaxslam.logs.odometry import Odometry
 from jaxslam.models import motion
 from jaxslam.models.sensors import Measurements
 from jaxslam.parameters import ALTERNATIVES, MOTION, Params, learned_by
 
-ESTIMATORS = ("fisher", "pathwise", "plain")
 DISCOUNT = 0.97
 BIASED = (
     "association 'maximum_likelihood' biases the score: noise comes out too small where landmarks "
@@ -40,8 +42,8 @@ BIASED = (
 
 
 class Data(NamedTuple):
-    """What the likelihood is of: `start_pose` [3], `start_cov` [3, 3], T frames' arrays, and a map
-    to start with (None: empty), as `filter.init` takes it."""
+    """A log as arrays: `start_pose` [3], `start_cov` [3, 3], T frames' odometry and measurements,
+    and an initial map as for `step.init` (None: empty)."""
 
     start_pose: jax.Array
     start_cov: jax.Array
@@ -54,8 +56,8 @@ class Score(NamedTuple):
     """Derivatives of the log likelihood by P parameters, and the likelihood.
 
     `total` [P] and `log_likelihood` []: of the whole log. `steps` [T, P] and `log_evidence` [T]:
-    the terms of every step (they sum to the total but for `fisher` with discount 1 and `pathwise`,
-    which are taken at the end). `min_ess` []: least effective sample size.
+    the terms of every step (they sum to the total but for discount 1, where it is taken at the
+    end). `min_ess` []: least effective sample size.
     """
 
     total: jax.Array
@@ -72,80 +74,86 @@ def learnable(config):
 
 
 def data_from_log(log, config, params=None, steps=None):
-    """`Data` of a `Log`; `steps`: filled up with so many frames of nothing (None: not).
+    """Make `Data` of a `Log`; `steps`: padded to this number of frames (None: not padded).
 
-    Places are shifted so that the start is near the origin; float32 has 7 digits. Raises
-    `ValueError` when the log can't supply what the configuration asks or has more steps.
+    Positions are relative to the start, as float32 has 7 digits. Raises `ValueError` when the log
+    lacks what the configuration needs, or has more frames than `steps`.
     """
-    made = frames_from_log(
-        log, config.sensor, config.measurements, params, config.association == "known"
-    )
-    total = len(made.time)
+    frames = frames_from_log(log, dataclasses.replace(config, descriptors=0), params)
+    total = len(frames.time)
     steps = total if steps is None else steps
     if steps < total:
         raise ValueError(f"{log.name}: has {total} frames, more than the {steps} asked for")
     real = jnp.zeros(()).dtype
 
-    def fill(leaf):
+    def pad(leaf):
         leaf = np.pad(leaf, [(0, steps - total), *[(0, 0)] * (leaf.ndim - 1)])
         return jnp.asarray(leaf.astype(real) if leaf.dtype.kind == "f" else leaf)
 
     start = jnp.asarray([0.0, 0.0, log.start_pose[2]], real)
-    arrays = jax.tree.map(fill, (made.odometry, made.measurements))
+    arrays = jax.tree.map(pad, (frames.odometry, frames.measurements))
     return Data(start, jnp.asarray(log.start_cov, real), *arrays)
 
 
-def log_likelihood(params, log, key, config, estimator="fisher", discount=DISCOUNT):
-    """Estimate of the log likelihood of a `Log` or `Data`, with a derivative by `params`.
+def log_likelihood(
+    params: Params,
+    log: Log | Data,
+    key: jax.Array,
+    config: Config,
+    discount: float | jax.Array = DISCOUNT,
+) -> jax.Array:
+    """Estimate the log likelihood of a `Log` or `Data`; differentiable by `params`.
 
-    `jax.grad` gives the `estimator` chosen, for `Params` or any values put into them. It is no
-    derivative of the value returned: that one jumps. Derivatives by what `learnable` does not name
-    are zero. The value includes, besides the filter's evidence, the probability of as few new
-    landmarks as there were (`frame_terms`). Raises `ValueError` for an estimator that is not there.
+    `jax.grad` gives the Fisher score (`score`), not the derivative of the value returned, which
+    jumps. Derivatives by parameters that are not `learnable` are zero. Besides the filter's
+    evidence the value includes the probability of the number of new landmarks (`frame_terms`).
     """
-    check(config, estimator)
+    check(config)
     data = log if isinstance(log, Data) else data_from_log(log, config)
     numbers = Params(*(jnp.asarray(value, data.start_pose.dtype) for value in params))
     discount = jnp.asarray(discount, data.start_pose.dtype)
-    return _differentiable(config, estimator, numbers, discount, data, key)
+    return _differentiable(config, numbers, discount, data, key)
 
 
-def score(params, log, key, config, names, estimator="fisher", discount=DISCOUNT):
-    """`Score` of a `Log` or `Data` by the parameters `names`, of which `learnable` has the list.
+def score(
+    params: Params,
+    log: Log | Data,
+    key: jax.Array,
+    config: Config,
+    names: Sequence[str],
+    discount: float = DISCOUNT,
+) -> Score:
+    """Compute the `Score` of a `Log` or `Data` by the parameters `names` (`learnable` lists them).
 
-    `estimator`: `fisher`, along frozen paths; with `discount` 1 its expectation, weighted with the
-    likelihood estimates, is exactly the likelihood's derivative. `pathwise`: paths move with the
-    parameters, weights keep their derivative through resampling. `plain`: what automatic
-    differentiation of the filter gives, biased; for comparison. `discount` is `fisher`'s alone.
-    Raises `ValueError` for names that have no derivative.
+    With `discount` 1 its expectation, weighted with the likelihood estimates, is exactly the
+    likelihood's derivative. Raises `ValueError` for names that have no derivative.
     """
-    check(config, estimator, names)
+    check(config, names)
     data = log if isinstance(log, Data) else data_from_log(log, config)
     numbers = Params(*(jnp.asarray(value, data.start_pose.dtype) for value in params))
-    return score_and_value(numbers, data, key, config, tuple(names), estimator, discount)
+    return score_and_value(numbers, data, key, config, tuple(names), discount)
 
 
-def check(config, estimator="fisher", names=()):
-    """Raise `ValueError` for what is not there; warn of an association that biases the score."""
-    if estimator not in ESTIMATORS:
-        raise ValueError(f"estimator: {estimator!r} is not one of {', '.join(ESTIMATORS)}")
+def check(config, names=()):
+    """Raise `ValueError` for names without a derivative; warn of an association that biases the
+    score."""
     allowed = learnable(config)
     for name in names:
         if name not in allowed:
             raise ValueError(
-                f"{name!r} can't be learnt with sensor {config.sensor}; these can: "
+                f"{name!r} can't be learned with sensor {config.sensor}; these can: "
                 f"{', '.join(allowed)}"
             )
     if config.association == "maximum_likelihood":
         warnings.warn(BIASED, stacklevel=3)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _differentiable(config, estimator, params, discount, data, key):
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _differentiable(config, params, discount, data, key):
     return value(params, data, key, config)
 
 
-def _derivative(config, estimator, primals, tangents):
+def _derivative(config, primals, tangents):
     params, discount, data, key = primals
     moved = [
         name
@@ -153,7 +161,7 @@ def _derivative(config, estimator, primals, tangents):
         if not isinstance(tangent, jax.custom_derivatives.SymbolicZero)
     ]
     names = tuple(name for name in learnable(config) if name in moved)
-    found = score_and_value(params, data, key, config, names, estimator, discount)
+    found = score_and_value(params, data, key, config, names, discount)
     along = [getattr(tangents[0], name) * found.total[i] for i, name in enumerate(names)]
     return found.log_likelihood, sum(along, jnp.zeros_like(found.log_likelihood))
 
@@ -177,26 +185,26 @@ def value(params, data, key, config):
 
 
 def _initial_state(data, key, config):
-    """`filter.State` before the first frame."""
+    """`State` before the first frame."""
     return fastslam.init(config, key, data.start_pose, data.start_cov, data.landmarks_given)
 
 
 def draw_for_frame(key, step, config):
-    """`filter.draws`, and for `known` associations uniforms to draw between slot and clutter."""
+    """Draw the random numbers of a step; with `known` association also uniforms for clutter."""
     chance = fastslam.draw_random_numbers(key, step, config)
     if config.association == "known" and config.clutter:
         shape = config.measurements, config.particles
-        own = jax.random.fold_in(key, 2**30 + step)  # no step's key, nor any of its parts
+        own = jax.random.fold_in(key, 2**30 + step)  # different from every step's keys
         chance = chance._replace(picks=jax.random.uniform(own, shape, float))
     return chance
 
 
 def frame_terms(measurements, params):
-    """What a frame adds to the log likelihood for every particle alike.
+    """Terms of a frame's log likelihood that are equal for all particles.
 
-    New landmarks are a Poisson process of `density_new` per m^2 of the view, so having seen no more
-    than there are costs density times area (without it the likelihood would only ever grow with the
-    density). Positions that rest on odometry were multiplied by its gain: the change of area.
+    New landmarks are a Poisson process of `density_new` per m^2 of the view, whose normalization is
+    density times area (without it the likelihood would increase with the density for ever).
+    Positions derived from odometry were multiplied by its gain: the Jacobian of that scaling.
     """
     area = (params.view_max - params.view_min) * params.view_range**2 / 2
     term = jnp.where(measurements.active, -params.density_new * area, 0.0)
@@ -207,12 +215,11 @@ def frame_terms(measurements, params):
 
 
 class _Carry(NamedTuple):
-    """State; derivatives by the parameters (first axis) of every particle's pose (None: held
-    still), its landmarks and its log weight, as inherited; sums of the steps' scores and of what
-    all particles share of them; least effective sample size."""
+    """State; derivatives by the parameters (first axis) of every particle's landmarks, and of its
+    log weight as inherited; sums of the steps' scores and of their part common to all particles;
+    least effective sample size."""
 
     state: fastslam.State
-    pose: jax.Array | None
     world: dict
     inherited: jax.Array
     total: jax.Array
@@ -220,131 +227,105 @@ class _Carry(NamedTuple):
     ess: jax.Array
 
 
-@partial(jax.jit, static_argnames=("config", "names", "estimator"))
-def score_and_value(params, data, key, config, names, estimator="fisher", discount=DISCOUNT):
-    """`score` of `Data`, unchecked, for use inside other compiled programs."""
-    frozen = estimator == "fisher"
-    # Derivatives are resampled along with the landmarks; where these lie makes no difference.
+@partial(jax.jit, static_argnames=("config", "names"))
+def score_and_value(params, data, key, config, names, discount=DISCOUNT):
+    """`score` of `Data` without checks, for use inside compiled functions."""
+    # Derivatives are resampled along with the landmarks, which is not done lazily.
     config = dataclasses.replace(config, lazy=False)
     start, key = jax.random.split(key)
     state = _initial_state(data, start, config)
-    through = _filter_through(names, config, data.measurements, frozen)
-    zero = jnp.zeros((len(through), *state.pose.shape), state.pose.dtype)
+    through = _filter_through(names, config, data.measurements)
+    dtype = state.pose.dtype
     carry = _Carry(
         state,
-        None if frozen else zero,
-        {name: jnp.zeros((len(through), *getattr(state.landmarks, name).shape), zero.dtype)
-         for name in _parts(through, config, frozen)},
-        jnp.zeros((len(names), config.particles), zero.dtype),
-        jnp.zeros(len(names), zero.dtype),
-        jnp.zeros(len(names), zero.dtype),
-        jnp.asarray(config.particles, zero.dtype),
+        {name: jnp.zeros((len(through), *getattr(state.landmarks, name).shape), dtype)
+         for name in _parts(through, config)},
+        jnp.zeros((len(names), config.particles), dtype),
+        jnp.zeros(len(names), dtype),
+        jnp.zeros(len(names), dtype),
+        jnp.asarray(config.particles, dtype),
     )  # fmt: skip
 
     def step(carry, frame):
-        return _step(carry, frame, params, key, config, names, through, estimator, discount)
+        return _step(carry, frame, params, key, config, names, through, discount)
 
-    looks = data.odometry, data.measurements
-    last, (steps, log_evidence) = jax.lax.scan(step, carry, looks)
+    frames = data.odometry, data.measurements
+    last, (steps, log_evidence) = jax.lax.scan(step, carry, frames)
     weight = jnp.exp(last.state.log_weight)
     at_end = last.inherited @ weight + last.shared
-    whole = discount == 1 if frozen else estimator == "pathwise"
-    total = jnp.where(whole, at_end, last.total)
+    total = jnp.where(discount == 1, at_end, last.total)
     return Score(total, log_evidence.sum(), steps, log_evidence, last.ess)
 
 
-def _filter_through(names, config, measurements, frozen):
-    """Those of the names whose derivatives go through poses or landmarks."""
-    if not frozen:
-        return names
+def _filter_through(names, config, measurements):
+    """The names whose derivatives pass through the landmarks."""
     sensor = learned_by(config.sensor)
     if measurements.scale is not None:
         sensor = (*sensor, "gain_tran")
     return tuple(name for name in names if name in sensor)
 
 
-def _parts(through, config, frozen):
-    """Arrays of the map that have derivatives: an anchor moves with poses and mounting only."""
+def _parts(through, config):
+    """Arrays of the map that have derivatives: anchors depend on the mounting only."""
     if not through:
         return ()
-    anchored = config.sensor == "bearing" and (not frozen or {"mount_x", "mount_y"} & {*through})
+    anchored = config.sensor == "bearing" and {"mount_x", "mount_y"} & {*through}
     return ("mean", "factor", "anchor") if anchored else ("mean", "factor")
 
 
-def _step(carry, frame, params, key, config, names, through, estimator, discount):
-    """A filter step that takes the derivatives along."""
-    frozen = estimator == "fisher"
+def _step(carry, frame, params, key, config, names, through, discount):
+    """A filter step that propagates the derivatives."""
     state, (odometry, measurements) = carry.state, frame
     chance = draw_for_frame(key, state.step, config)
-    seen, pose_dot, world_dot, by_density = _look(
-        carry, chance, frame, params, config, through, frozen
-    )
+    seen, world_dot, by_density = _observe(carry, chance, frame, params, config, through)
     gained = dict(zip(through, by_density, strict=True))
-    if frozen:
-        drawn = motion_score(
-            seen.u, odometry, params, [n for n in names if n in learned_by(MOTION)]
-        )
-        told = alternatives_score(seen.match, params)
-        for name, more in {**drawn, **{n: told[n] for n in names if n in told}}.items():
-            gained[name] = gained[name] + more if name in gained else more
-    after, info = fastslam.conclude(chance, state, seen, measurements, config)
+    drawn = motion_score(seen.u, odometry, params, [n for n in names if n in learned_by(MOTION)])
+    chosen = alternatives_score(seen.match, params)
+    for name, more in {**drawn, **{n: chosen[n] for n in names if n in chosen}}.items():
+        gained[name] = gained[name] + more if name in gained else more
+    after, info = fastslam.weigh_and_resample(chance, state, seen, measurements, config)
     before, weight = jnp.exp(state.log_weight), jnp.exp(info.log_weight)
-    keep = discount if frozen else 1.0
-    inherited = keep * carry.inherited
+    inherited = discount * carry.inherited
     own = inherited + jnp.stack([gained[name] for name in names]) if names else inherited
-    # What has no weight has no say, not even as 0 times NaN.
+    # A particle without weight must not contribute, not even 0 times NaN.
     own = jnp.where(weight > 0, own, 0.0)
     extra = _frame_score(measurements, params, names)
     gradient = own @ weight - inherited @ before + extra
-    # Plain differentiation takes the weights after resampling for constants.
-    own_after = jnp.where(info.resampled, 0.0, own) if estimator == "plain" else own
-    pose_dot, world_dot, own_after = resampling.gather(
-        (pose_dot, world_dot, own_after), info.ancestors, info.resampled, config
-    )
+    world_dot, own = resampling.gather((world_dot, own), info.ancestors, info.resampled, config)
     log_evidence = info.log_evidence + frame_terms(measurements, params)
     sums = carry.total + gradient, carry.shared + extra, jnp.minimum(carry.ess, info.ess)
-    return _Carry(after, pose_dot, world_dot, own_after, *sums), (gradient, log_evidence)
+    return _Carry(after, world_dot, own, *sums), (gradient, log_evidence)
 
 
-def _look(carry, chance, frame, params, config, through, frozen):
-    """`Observed` of the particles, and its derivatives: pose, map, density, by `through`."""
+def _observe(carry, chance, frame, params, config, through):
+    """`Observed` of the particles, and derivatives of map and density by `through`."""
     state = carry.state
     parts = tuple(carry.world)
 
-    def look(values, pose, arrays):
-        world = state.landmarks._replace(**arrays)
+    def observe(values, arrays):
         given = params._replace(**dict(zip(through, values, strict=True)))
-        moved = state._replace(pose=pose, landmarks=world)
-        seen = blocks.observe(moved, chance, *frame, given, config, frozen=frozen)
-        moved = None if frozen else seen.pose
-        return (moved, {name: getattr(seen.landmarks, name) for name in parts}, seen.density), seen
+        moved = state._replace(landmarks=state.landmarks._replace(**arrays))
+        seen = blocks.observe(moved, chance, *frame, given, config, frozen=True)
+        return ({name: getattr(seen.landmarks, name) for name in parts}, seen.density), seen
 
     values = tuple(getattr(params, name) for name in through)
     arrays = {name: getattr(state.landmarks, name) for name in parts}
     if not through:
-        seen = look(values, state.pose, arrays)[1]
-        return seen, carry.pose, {}, ()
+        return observe(values, arrays)[1], {}, ()
 
-    def push(direction, pose_dot, world_dot):
-        direction = tuple(direction)
-        if frozen:
-            return jax.jvp(
-                lambda v, a: look(v, state.pose, a),
-                (values, arrays), (direction, world_dot), has_aux=True,
-            )  # fmt: skip
-        return jax.jvp(
-            look, (values, state.pose, arrays), (direction, pose_dot, world_dot), has_aux=True
-        )
+    def push(direction, world_dot):
+        tangents = tuple(direction), world_dot
+        return jax.jvp(observe, (values, arrays), tangents, has_aux=True)
 
     basis = jnp.eye(len(through), dtype=state.pose.dtype)
-    _, (pose_dot, world_dot, by_density), seen = jax.vmap(
-        push, in_axes=(0, None if frozen else 0, 0), out_axes=(None, 0, None)
-    )(basis, carry.pose, carry.world)
-    return seen, pose_dot, world_dot, by_density
+    _, (world_dot, by_density), seen = jax.vmap(push, in_axes=0, out_axes=(None, 0, None))(
+        basis, carry.world
+    )
+    return seen, world_dot, by_density
 
 
 def motion_score(u, odometry, params, names):
-    """Derivatives [n] by name of the log density of the poses drawn, these held still."""
+    """Derivatives [N] by name of the log density of the poses drawn, with these fixed."""
 
     def density(values):
         return motion.log_density_of(u, odometry, params._replace(**values), params)
@@ -353,7 +334,7 @@ def motion_score(u, odometry, params, names):
 
 
 def alternatives_score(match, params):
-    """Derivatives [n] of the log probabilities of clutter and of new landmarks drawn, by name."""
+    """Derivatives [N] by name of the log probability of the clutter and new landmarks drawn."""
     new = (match == NEW).sum(0)
     clutter = (match == CLUTTER).sum(0)
     real = new + (match >= 0).sum(0)

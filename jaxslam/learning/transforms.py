@@ -1,6 +1,6 @@
-"""The scale on which parameters are learnt: there every real number is allowed.
+"""The free scale, on which parameters are learned and every real number is allowed.
 
-Logarithms of what is positive, log-odds of a probability, in units of which one is a large change:
+Logarithms of positive values, log-odds of probabilities, in units of which one is a large change:
 a factor e of a noise, a tenth of a gain, 0.1 m or rad of the mounting.
 """
 
@@ -12,7 +12,7 @@ from jaxslam.parameters import TABLE
 
 
 def to_free(name, value):
-    """A parameter's value on the free scale."""
+    """Transform a parameter's value to the free scale."""
     row = TABLE[name]
     if row.scale == "logit":
         return jnp.log(value) - jnp.log1p(-value)
@@ -20,7 +20,7 @@ def to_free(name, value):
 
 
 def from_free(name, free):
-    """A parameter's value from the free scale."""
+    """Transform a value on the free scale to the parameter's."""
     row = TABLE[name]
     if row.scale == "logit":
         return jax.nn.sigmoid(free)
@@ -29,31 +29,31 @@ def from_free(name, free):
 
 
 def with_free(params, names, free):
-    """`params` with the values that `free` [P] stands for."""
+    """Replace the parameters `names` by those of `free` [P]."""
     return params._replace(**{n: from_free(n, free[i]) for i, n in enumerate(names)})
 
 
 def to_params(params, names, free):
-    """`put` with floats, worked out in double precision."""
+    """`with_free` with floats, computed in double precision."""
     with jax.enable_x64(True):
-        found = {n: float(from_free(n, float(free[i]))) for i, n in enumerate(names)}
-    return params._replace(**found)
+        values = {n: float(from_free(n, float(free[i]))) for i, n in enumerate(names)}
+    return params._replace(**values)
 
 
 def free_vector(params, names):
-    """The free values [P] (float64) of the parameters `names`.
+    """Compute the free values [P] (float64) of the parameters `names`.
 
-    Raises `ValueError` for a value that has none, such as a noise of zero.
+    Raises `ValueError` for a value without one, such as a noise of zero.
     """
     for name in names:
         value = float(getattr(params, name))
         if TABLE[name].scale != "linear" and value <= 0:
-            raise ValueError(f"{name} is {value:g}: to be learnt it must start above 0")
+            raise ValueError(f"{name} is {value:g}: to be learned it must start above 0")
     with jax.enable_x64(True):
         return np.array([float(to_free(n, float(getattr(params, n)))) for n in names])
 
 
 def derivative_at(name, free):
-    """Units of a parameter per unit of the free scale."""
+    """Derivative of a parameter by its free value, at `free`."""
     with jax.enable_x64(True):
         return float(jax.grad(lambda f: from_free(name, f))(float(free)))

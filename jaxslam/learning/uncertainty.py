@@ -8,6 +8,7 @@ the inverse of their mean. Where they differ by more than noise, the model is wr
 sandwich (Huber 1967, White 1982). All of it on the free scale of `scale`.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -17,6 +18,7 @@ import numpy as np
 from jaxslam.learning import fit as learn
 from jaxslam.learning import likelihood
 from jaxslam.learning.transforms import derivative_at, to_params
+from jaxslam.logs.log import Log
 from jaxslam.parameters import Params
 
 OPEN = 1.0  # free scale: a standard deviation from which on a direction is unresolved
@@ -66,7 +68,13 @@ class Uncertainty(NamedTuple):
     unresolved: tuple
 
 
-def assess(fit, logs, seeds=8, seed=1, discounts=(0.9, likelihood.DISCOUNT, 1.0)):
+def assess(
+    fit: learn.Fit,
+    logs: Sequence[Log],
+    seeds: int = 8,
+    seed: int = 1,
+    discounts: Sequence[float] = (0.9, likelihood.DISCOUNT, 1.0),
+) -> Uncertainty:
     """`Uncertainty` of a `learn.Fit` to these logs: 2 P + 3 times `seeds` filter runs of each."""
     names, config = fit.names, fit.config
     data = learn.stack_logs(logs, config, fit.params)
@@ -109,7 +117,7 @@ def assess(fit, logs, seeds=8, seed=1, discounts=(0.9, likelihood.DISCOUNT, 1.0)
     )
 
 
-def improve(fit, errors):
+def improve(fit: learn.Fit, errors: Uncertainty) -> learn.Fit:
     """The `learn.Fit` after the Newton step that `assess` found: Adam's last iterates still swing
     about the root (experiments/recovery.py, bearings alone: RMS z 1.60 before such steps, 1.10
     after)."""

@@ -1,10 +1,10 @@
-"""What a log's descriptors tell of identity.
+"""The space in which a log's descriptors are compared to tell landmarks apart.
 
 A log may describe each measurement by numbers of any kind and unit (`Log.descriptor`: colours, an
-edge's ends). Rows of successive frames that can only be of one landmark are linked, and of all
-directions in the descriptors those are kept in which a landmark varies least, compared with all
-such rows (linear discriminants: Rao 1948). Of what lies along them the ranks count, as normal
-scores: each coordinate is standard normal over the log, whatever the columns were. NumPy, SciPy.
+edge's ends). Measurements of successive frames that can only be of one landmark are linked into
+tracks. Of all directions in the descriptors those are kept in which a landmark varies least,
+compared with all linked measurements (linear discriminants: Rao 1948). Along each direction ranks
+become normal scores: each coordinate is standard normal over the log. NumPy and SciPy.
 """
 
 from typing import NamedTuple
@@ -15,70 +15,70 @@ from scipy.special import ndtri
 from jaxslam.logs.odometry import increments
 from jaxslam.logs.truth import wrap
 
-ALONE = 0.06  # rad: a row that no other of its frame is nearer to can be linked,
-STEP = 0.03  # rad, to one that is no farther from where the turn takes it,
-APART = 1.0  # s later at most
-ROWS = 20  # links a direction, at least: of fewer, noise passes for looks
-MOST = 6  # coordinates
-USEFUL = 0.5  # variance of a linked landmark's coordinate, at most
-BEYOND = 4.0  # standard deviations of a column: what is farther off tells no more
-VARIED = 1e-5  # variance of a direction relative to the largest: less is rounding
+ISOLATION = 0.06  # rad: a measurement is linked only if no other is a candidate within this,
+STEP = 0.03  # rad: and if its partner is within this of where the robot's turn takes it
+MAX_GAP = 1.0  # s between linked frames
+MIN_LINKS = 20  # per direction: with fewer, noise is mistaken for appearance
+MAX_COORDINATES = 6
+MAX_WITHIN = 0.5  # variance of one landmark's coordinate; larger ones do not tell landmarks apart
+CLIP = 4.0  # standard deviations of a column: outliers beyond it carry no further information
+MIN_VARIANCE = 1e-5  # of a direction, relative to the largest: less is rounding
 
 
 class AppearanceSpace(NamedTuple):
-    """Where descriptors are compared: `coordinates` [n, J] of all rows, normal scores; and `within`
-    [J], the variance of one landmark's that is reckoned with."""
+    """Normal scores `coordinates` [n, J] of all measurements, and `within` [J], the variance
+    assumed of one landmark's coordinates."""
 
     coordinates: np.ndarray
     within: np.ndarray
 
 
 def fit_appearance_space(log):
-    """`Space` of a log's descriptors; without coordinates where they tell nothing."""
-    nothing = AppearanceSpace(np.zeros((len(log.frame), 0)), np.zeros(0))
+    """Fit the `AppearanceSpace` of a log; J = 0 if its descriptors tell no landmarks apart."""
+    empty = AppearanceSpace(np.zeros((len(log.frame), 0)), np.zeros(0))
     if log.descriptor is None or len(log.frame) == 0:
-        return nothing
+        return empty
     x = _rescale(log.descriptor.astype(float))
     track = _tracks(log)
     inside = track >= 0
     freedom = inside.sum() - len(np.unique(track[inside]))
-    if x.shape[1] == 0 or freedom < ROWS:
-        return nothing
+    if x.shape[1] == 0 or freedom < MIN_LINKS:
+        return empty
     linked, track = x[inside], track[inside]
-    own, whole = _within(linked, track), np.cov(linked.T).reshape(len(x.T), -1)
-    # Columns may repeat each other: only directions in which linked rows vary at all.
-    spread, vector = np.linalg.eigh(whole)
-    kept = spread > VARIED * max(spread[-1], VARIED)
-    if freedom < ROWS * kept.sum():
-        return nothing
+    within, total = _within(linked, track), np.cov(linked.T).reshape(len(x.T), -1)
+    # Columns may repeat each other: keep directions in which linked rows vary at all.
+    spread, vector = np.linalg.eigh(total)
+    kept = spread > MIN_VARIANCE * max(spread[-1], MIN_VARIANCE)
+    if freedom < MIN_LINKS * kept.sum():
+        return empty
     white = vector[:, kept] / np.sqrt(spread[kept])
-    value, vector = np.linalg.eigh(_products(white.T, _products(own, white)))
-    along = _products(white, vector[:, value < USEFUL][:, :MOST])
+    value, vector = np.linalg.eigh(_products(white.T, _products(within, white)))
+    along = _products(white, vector[:, value < MAX_WITHIN][:, :MAX_COORDINATES])
     if along.shape[1] == 0:
-        return nothing
+        return empty
     along *= np.sign(along[np.abs(along).argmax(0), np.arange(along.shape[1])])
     coordinates = _normal_scores(_products(x, along))
     scores = coordinates[inside]
-    value = np.diag(_within(scores, track)) / np.maximum(scores.var(0), VARIED)
-    good = value < USEFUL
-    # Links last a few frames, in which light and background change less than over a log.
+    value = np.diag(_within(scores, track)) / np.maximum(scores.var(0), MIN_VARIANCE)
+    good = value < MAX_WITHIN
+    # Links last a few frames, in which light and background change less than over a log: the root
+    # of the variance, which is below 1, is a larger one.
     return AppearanceSpace(
         coordinates[:, good], np.round(np.sqrt(np.maximum(value[good], 1e-4)), 4)
     )
 
 
 def _rescale(x):
-    """Columns [n, D] of about unit variance, without those that are constant; few rows far off
-    decide nothing."""
+    """Scale columns [n, D] to about unit variance, robustly, and drop constant ones."""
     x = x[:, x.std(0) > 1e-6 * np.abs(x).max(0)]
     x = x - np.median(x, 0)
-    usual = 1.4826 * np.median(np.abs(x), 0)
-    x = np.clip(x / np.where(usual > 0, usual, np.maximum(x.std(0), 1e-300)), -BEYOND, BEYOND)
+    spread = 1.4826 * np.median(np.abs(x), 0)
+    x = np.clip(x / np.where(spread > 0, spread, np.maximum(x.std(0), 1e-300)), -CLIP, CLIP)
     return x - x.mean(0)
 
 
 def _within(x, track):
-    """Covariance [D, D] of the rows of one track about their mean."""
+    """Covariance [D, D] of rows about the mean of their track."""
     number, track = np.unique(track, return_inverse=True)
     size = np.bincount(track)
     mean = np.stack([np.bincount(track, column) for column in x.T], 1) / size[:, None]
@@ -87,23 +87,25 @@ def _within(x, track):
 
 
 def _normal_scores(x):
-    """Every column's ranks [n, J] as quantiles of the standard normal; rounded, so that ranks and
-    scores are the same on all machines of a run."""
-    found = []
+    """Map the ranks in each column [n, J] to quantiles of the standard normal.
+
+    Rounded, so that ranks and scores are the same on all machines of a run.
+    """
+    scores = []
     for column in np.round(x, 4).T:
-        _, place, count = np.unique(column, return_inverse=True, return_counts=True)
-        middle = np.cumsum(count) - count / 2  # of equals: their mean rank, less a half
-        found.append(ndtri(middle / len(column))[place])
-    return np.round(np.column_stack(found), 4)
+        _, index, count = np.unique(column, return_inverse=True, return_counts=True)
+        middle = np.cumsum(count) - count / 2  # ties get their mean rank, less a half
+        scores.append(ndtri(middle / len(column))[index])
+    return np.round(np.column_stack(scores), 4)
 
 
 def _products(a, b):
-    """Matrix product that does not depend on the number of threads, as that of a BLAS does."""
+    """Matrix product that does not depend on the number of threads, unlike a BLAS's."""
     return np.einsum("ij,jk->ik", a, b)
 
 
 def _tracks(log):
-    """Of every row the number of its track [n], rows linked from frame to frame; -1: alone."""
+    """Track number [n] of every measurement, linked from frame to frame; -1: not linked."""
     bearing = log.bearing
     if bearing is None:
         bearing = np.arctan2(log.point[:, 1], log.point[:, 0])
@@ -113,9 +115,9 @@ def _tracks(log):
     for f in range(len(log.frame_time) - 1):
         (a, b, c) = bounds[f : f + 3]
         apart = np.abs(wrap(bearing[b:c] - (bearing[a:b] - turn[f + 1])[:, None]))
-        alone = (apart < ALONE).sum(1) == 1, (apart < ALONE).sum(0) == 1
-        near = log.frame_time[f + 1] - log.frame_time[f] <= APART * 1e9
-        pair = (apart < STEP) & alone[0][:, None] & alone[1] & near
+        unique = (apart < ISOLATION).sum(1) == 1, (apart < ISOLATION).sum(0) == 1
+        near = log.frame_time[f + 1] - log.frame_time[f] <= MAX_GAP * 1e9
+        pair = (apart < STEP) & unique[0][:, None] & unique[1] & near
         for i, j in zip(*np.nonzero(pair), strict=True):
             if track[a + i] < 0:
                 track[a + i], count = count, count + 1

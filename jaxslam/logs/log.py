@@ -1,31 +1,35 @@
-"""The log: what a robot drove and measured, and the file that keeps it.
+"""The log: what a robot drove and measured.
 
-The border of the project: left of it sensors, images and foreign files, right of it the filter.
-Stamps are int64 nanoseconds of one clock; lengths metres; angles radians, counter-clockwise, x
-forward. A file is one `.npz` whose entries are the fields below by name, those of the truth and
-the plan under `truth/` and `plan/`, and numbers under `noise/` and `skipped/`. Never pickled.
+The interface between sensors, images and files on one side and the filter on the other. Stamps are
+int64 nanoseconds of one clock; lengths metres; angles radians, counter-clockwise, x forward.
+`log_file` stores the fields below by name.
 """
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxslam.logs.validation import assign, check_array, check_number, check_rows, check_stamps
 from jaxslam.parameters import FORMER_NAMES, Params
 
-# Rows by design not for the filter (another robot seen) are counted under reasons that start so.
+if TYPE_CHECKING:
+    from jaxslam.logs.appearance_space import AppearanceSpace
+
+# Prefix of reasons in `Log.skipped` for rows that the filter has no use for (another robot seen).
 NOT_USED = "not used: "
 KINDS = ("velocity", "command")
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What was true, where known; the filter never gets it.
+    """Ground truth, as far as it is known (None: unknown); the filter never gets it.
 
     `time` int64 [P] ns with `pose` [P, 3] (x, y, heading); `landmarks` [L, 2] with `landmark_id`
     int64 [L]; `identity` int64 [n]: the true landmark's id per measurement, -1 for clutter;
-    `resolution` [m] of the poses (0: exact; 0.3 for readings off floor tiles). None: not known.
+    `resolution` [m] of the poses (0: exact; 0.3 for readings off floor tiles).
     """
 
     time: np.ndarray | None = None
@@ -59,10 +63,8 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class FloorPlan:
-    """To be drawn under a map: `segments` [S, 4] (x1, y1, x2, y2) in m, or `image` uint8 [H, W].
-
-    The image has `scale` m per pixel and its lower-left corner at `origin`.
-    """
+    """Background of a map: `segments` [S, 4] (x1, y1, x2, y2) in m, or `image` uint8 [H, W] with
+    `scale` m per pixel and its lower-left corner at `origin` [m]."""
 
     segments: np.ndarray | None = None
     image: np.ndarray | None = None
@@ -86,20 +88,22 @@ class FloorPlan:
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Log:
-    """One logged run, validated when made; arrays are read-only copies.
+    """One recorded drive, validated on construction; arrays are read-only copies.
 
-    `odometry` [O, 2] of kind "velocity" (forward m/s, yaw rate rad/s, held from its stamp until the
-    next) or "command" (distance m, then turn rad, executed in the interval that ends at its stamp).
-    `frame_time` [F] is every time the sensor looked, also when it saw nothing; `frame` [n] is the
-    frame of each measurement. `bearing` [n], `range` [n], `point` [n, 2] and `point_cov` [n, 3]
-    (xx, xy, yy) are in the sensor's frame, NaN where a bearing has no point; `point_baseline` [n]
-    is the distance by odometry that a point's size rests on, NaN where it rests on none; so a gain
-    of the odometry rescales it. `bearing_sigma` [n] rad is the standard deviation of a bearing as
-    its detector states it. `identity` [n] is measured, -1 where none was.
-    `view` (least bearing, largest bearing, largest range) is what the sensor can see, `mounting`
-    (x, y, yaw) its pose on the robot, `time_offset` [s] what was added to the frames' stamps.
-    `noise` declares values of `Params`. `start_pose`, `start_cov`: where the robot was at `start`.
-    `skipped`: rows the reader dropped, by reason.
+    - `odometry` [O, 2] of kind "velocity" (forward m/s, yaw rate rad/s, held from its stamp until
+      the next) or "command" (distance m, then turn rad, executed in the interval that ends at its
+      stamp).
+    - `frame_time` [F]: stamps of all frames, also empty ones; `frame` [n]: the frame of each
+      measurement, not decreasing.
+    - `bearing`, `range` [n], `point` [n, 2], `point_cov` [n, 3] (xx, xy, yy) in the sensor's frame,
+      NaN where a bearing has no point. `bearing_sigma` [n] rad, as the detector states it.
+      `point_baseline` [n]: distance by odometry from which a point was triangulated, NaN where it
+      was not; a gain of the odometry rescales such a point.
+    - `identity` [n] as measured, -1 where none was; `descriptor` [n, D] describes appearance.
+    - `view` (least bearing, largest bearing, largest range) of the sensor; `mounting` (x, y, yaw),
+      its pose on the robot; `time_offset` [s], added to the frames' stamps before.
+    - `noise` declares values of `Params`. `start_pose`, `start_cov`: the robot's pose at `start`.
+    - `skipped`: how many rows the reader dropped, by reason.
 
     Raises `ValueError` naming field, row and what is allowed.
     """
@@ -122,8 +126,8 @@ class Log:
     mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)
     time_offset: float = 0.0
     noise: dict[str, float] = field(default_factory=dict)
-    start_pose: np.ndarray = (0.0, 0.0, 0.0)
-    start_cov: np.ndarray = ((0.0, 0.0, 0.0),) * 3
+    start_pose: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    start_cov: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
     truth: Truth | None = None
     plan: FloorPlan | None = None
     skipped: dict[str, int] = field(default_factory=dict)
@@ -147,18 +151,25 @@ class Log:
         return f"Log({self.name!r}: {rows}, {len(self.frame)} measurements)"
 
     @property
-    def start(self):
+    def start(self) -> int:
         """Stamp [ns] at which `start_pose` holds: the first odometry or frame."""
         return min(int(self.odometry_time[0]), int(self.frame_time[0]))
 
-    def has(self, sensor):
-        """Whether the log can supply a sensor: position, range_bearing or bearing."""
-        bearing, both = self.bearing is not None, self.range is not None  # a range has a bearing
+    @cached_property
+    def appearance_space(self) -> "AppearanceSpace":
+        """`AppearanceSpace` of the log's descriptors, fitted when first used."""
+        from jaxslam.logs.appearance_space import fit_appearance_space  # here: SciPy is slow
+
+        return fit_appearance_space(self)
+
+    def has(self, sensor: str) -> bool:
+        """Whether the log can supply a sensor, one of `config.SENSORS`."""
+        bearing, both = self.bearing is not None, self.range is not None  # a range needs a bearing
         supplies = {"position": self.has_points() or both, "range_bearing": both}
         return (supplies | {"bearing": bearing}).get(sensor, False)
 
-    def has_points(self):
-        """Whether some row has a point."""
+    def has_points(self) -> bool:
+        """Whether any measurement has a point."""
         return self.point is not None and bool((~np.isnan(self.point)).any() or not len(self.frame))
 
 
@@ -239,7 +250,7 @@ def _check_points(log):
 
 def _check_sensor(log):
     least, largest, reach = check_array("view", log.view, np.float64, (3,)).tolist()
-    # The filter compares with bearings in [-pi, pi); turn the mounting, not the view.
+    # The filter's bearings are in [-pi, pi): a rotated sensor has another mounting, not view.
     if not -math.pi - 1e-9 <= least < largest <= math.pi + 1e-9 or reach <= 0:
         rule = "must be least and largest bearing within -pi..pi rad, and a range above 0 m"
         raise ValueError(f"view: {(least, largest, reach)} {rule}")

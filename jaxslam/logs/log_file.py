@@ -1,4 +1,8 @@
-"""The file of a log: a compressed `.npz` with a schema version, never pickled, capped in size."""
+"""The file of a log: a compressed `.npz` with a schema version, never pickled, capped in size.
+
+Entries are the fields of `Log` by name, those of the truth and the plan under `truth/` and `plan/`,
+and numbers under `noise/` and `skipped/`.
+"""
 
 import math
 import zipfile
@@ -19,17 +23,17 @@ MAX_DIMENSIONS = 4
 MAX_TEXT_BYTES = 1 << 16
 
 
-def save_log(path, log):
-    """Write a log to `path` (.npz), all or nothing: an interrupted write leaves the old file.
+def save_log(path: str | Path, log: Log) -> None:
+    """Write a log to `path` (.npz) atomically: an interrupted write leaves the old file.
 
-    Raises `ValueError` when the place can't be written.
+    Raises `ValueError` if it can't be written.
     """
     path = Path(path)
     if path.suffix != ".npz":
         raise ValueError(f"{path}: a log is a .npz file; name it {path.name}.npz")
     with atomic_write(path) as file, zipfile.ZipFile(file, "w") as archive:
         for name, array in entries_of(log).items():
-            # A fixed date: the same log makes the same bytes.
+            # A fixed date, so that the same log makes the same bytes.
             entry = zipfile.ZipInfo(name + ".npy", (1980, 1, 1, 0, 0, 0))
             entry.compress_type = zipfile.ZIP_DEFLATED
             with archive.open(entry, "w", force_zip64=True) as member:
@@ -37,8 +41,8 @@ def save_log(path, log):
 
 
 def entries_of(log):
-    """The file's entries, by name."""
-    entries = {"schema": np.int64(SCHEMA)}
+    """A log's arrays and numbers by the name of their entry."""
+    entries: dict = {"schema": np.int64(SCHEMA)}
     for part, prefix in ((log, ""), (log.truth, "truth/"), (log.plan, "plan/")):
         for item in fields(part) if part is not None else ():
             value = getattr(part, item.name)
@@ -49,8 +53,8 @@ def entries_of(log):
     return entries
 
 
-def load_log(path):
-    """The log in a `.npz` file, or the bundled one of that name (`lost-in-the-woods`).
+def load_log(path: str | Path) -> Log:
+    """Load the log of a `.npz` file, or the bundled one of that name (`lost-in-the-woods`).
 
     Raises `ValueError` naming the file and what is wrong with it.
     """
@@ -59,10 +63,10 @@ def load_log(path):
         with resources.as_file(source) as file:
             return load_log(file)
     path = Path(path)
-    if path.is_dir() or path.suffix.lower() in (".mat", ".csv", ".dat"):
-        raise ValueError(f"{path}: is no log; make one of it with: jaxslam convert {path} OUT.npz")
-    if not path.is_file():
+    if not path.exists():
         raise ValueError(f"{path}: no such file (bundled logs: {', '.join(BUNDLED)})")
+    if path.suffix.lower() != ".npz" and not (path.is_file() and zipfile.is_zipfile(path)):
+        raise ValueError(f"{path}: is no log; make one of it with: jaxslam convert {path} OUT.npz")
     try:
         return _build(_read_entries(path))
     except Exception as err:  # foreign bytes: zipfile, zlib and NumPy raise whatever they like
@@ -71,29 +75,29 @@ def load_log(path):
 
 
 def _read_entries(path):
-    """The file's arrays by name, each checked against the caps before a byte of it is unpacked."""
+    """Read the arrays by name; each is checked against the caps before it is unpacked."""
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         size = sum(member.file_size for member in members)
         if len(members) > MAX_ENTRIES or size > MAX_BYTES:
             found = f"{len(members)} entries of {size} bytes"
-            raise ValueError(f"{found}; allowed are {MAX_ENTRIES} of {MAX_BYTES}")
+            raise ValueError(f"{found}; allowed are {MAX_ENTRIES} of {MAX_BYTES} bytes")
         entries = {}
         for member in members:
             name = member.filename.removesuffix(".npy")
             if name == member.filename or name in entries:
-                raise ValueError(f"entry {member.filename!r} is no array, or there twice")
+                raise ValueError(f"entry {member.filename!r} is no array, or is there twice")
             with archive.open(member) as file:
                 _check_header(name, file, member.file_size)
             with archive.open(member) as file:
                 entries[name] = np.lib.format.read_array(file, allow_pickle=False)
-                if file.read(1):  # also reaches the end, where the checksum is compared
+                if file.read(1):  # also checks the CRC, at the end
                     raise ValueError(f"entry {name!r} is longer than its array")
     return entries
 
 
 def _check_header(name, file, size):
-    """Refuse objects and shapes that do not fit the entry's size."""
+    """Raise for objects, and for shapes that do not fit the entry's size."""
     old = np.lib.format.read_magic(file) == (1, 0)
     read = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(file)
@@ -107,7 +111,7 @@ def _check_header(name, file, size):
 
 
 def _build(entries):
-    """A `Log` of the file's entries."""
+    """Build the `Log` of a file's entries."""
     schema = entries.pop("schema", None)
     if schema is None or schema.tolist() != SCHEMA:
         raise ValueError(f"it has schema {schema}; this version reads {SCHEMA}")

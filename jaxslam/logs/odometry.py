@@ -1,7 +1,6 @@
-"""A log's odometry, integrated exactly between frames; NumPy alone.
+"""Integrate a log's odometry exactly between frames; NumPy alone.
 
-Odometry comes faster than frames, or slower; a log thinned to fewer frames describes the same
-motion.
+Odometry may come faster than frames, or slower: a log with fewer frames describes the same motion.
 """
 
 from typing import NamedTuple
@@ -10,7 +9,7 @@ import numpy as np
 
 
 class Odometry(NamedTuple):
-    """What the odometry says of one interval (or of T, stacked).
+    """Odometry of one interval (or of T, stacked).
 
     `dx, dy` [m] and `dtheta` [rad]: displacement in the robot's frame at the interval's start.
     `distance` [m], `turn` [rad]: sums of absolute values. `duration` [s]. `lever`: mean fraction of
@@ -27,13 +26,26 @@ class Odometry(NamedTuple):
     lever: np.ndarray
     lever_var: np.ndarray
 
+    @classmethod
+    def from_displacement(cls, dx: float, dy: float, dtheta: float, duration: float) -> "Odometry":
+        """`Odometry` of one interval from its displacement, driven along an arc.
+
+        `dx`, `dy` [m]: in the robot's frame at the interval's start; `dtheta` [rad]: less than a
+        full turn; `duration` [s]. For intervals with reversals or stops, sum up `distance` and
+        `turn` instead, as `increments` does.
+        """
+        distance = np.hypot(dx, dy) / np.sinc(dtheta / (2 * np.pi))  # chord to arc
+        values = dx, dy, dtheta, distance, abs(dtheta), duration, 0.5, 1 / 12
+        return cls(*map(np.asarray, values))
+
 
 def increments(log):
-    """`Odometry` [T] of the intervals that end at the frames; the first begins at `log.start`.
+    """Integrate the odometry to each frame from the one before, the first from `log.start`.
 
-    Steps of constant velocity are arcs, commands are translations with a turn at their end. Sums
-    over the steps of an interval are exact, as are the lever's mean and variance: the fraction of
-    the path still ahead is uniform within an arc and a constant at a command's turn.
+    Returns `Odometry` [T]. Steps of constant velocity are arcs, commands are translations with a
+    turn at their end. Sums over the steps of an interval are exact, as are the lever's mean and
+    variance: the fraction of the path still ahead is uniform within an arc, and fixed at a
+    command's turn.
     """
     bounds = np.concatenate([[log.start], log.frame_time])
     arc = log.odometry_kind == "velocity"
@@ -69,20 +81,27 @@ def increments(log):
 
 
 def _arcs(log, bounds):
-    """Frame, path [m] and turn [rad] of every step between stamps of odometry or frames."""
-    time = log.odometry_time
-    period = int(np.median(np.diff(time))) if len(time) > 1 else 0
-    edges = np.append(time, time[-1] + period)  # the last velocity is held for a usual period
+    """Frame, distance [m] and turn [rad] of every step between stamps of odometry or frames."""
+    edges, held = held_velocities(log)
     cuts = np.union1d(edges, bounds)
     cuts = cuts[(cuts >= bounds[0]) & (cuts <= bounds[-1])]
-    piece = np.searchsorted(edges, cuts[:-1], side="right")  # 0 and the last: the robot stands
-    velocity = np.vstack([[0.0, 0.0], log.odometry, [0.0, 0.0]])[piece]
+    velocity = held[np.searchsorted(edges, cuts[:-1], side="right")]
     travel, turn = (velocity * (np.diff(cuts) / 1e9)[:, None]).T
     return np.searchsorted(bounds[1:], cuts[1:]), travel, turn
 
 
+def held_velocities(log):
+    """Stamps [O + 1] at which the velocity changes, and the velocities [O + 2, 2] before, between
+    and after them: the robot stands before the first row, and holds the last for a median period.
+    """
+    time = log.odometry_time
+    period = int(np.median(np.diff(time))) if len(time) > 1 else 0
+    edges = np.append(time, time[-1] + period)
+    return edges, np.vstack([[0.0, 0.0], log.odometry, [0.0, 0.0]])
+
+
 def _commands(log):
-    """Frame, path [m] and turn [rad] of every command: the frame at its end, or the next one."""
+    """Frame at or after the end, distance [m] and turn [rad] of every command."""
     frame = np.searchsorted(log.frame_time, log.odometry_time)
     used = frame < len(log.frame_time)
     travel, turn = log.odometry[used].T
@@ -90,7 +109,8 @@ def _commands(log):
 
 
 def dead_reckoning(odometry, start_pose):
-    """Poses [T, 3] at the frames by odometry alone, heading in [-pi, pi); no gains applied."""
+    """Integrate the poses [T, 3] at the frames from odometry alone, without gains; heading in
+    [-pi, pi)."""
     before = start_pose[2] + np.cumsum(odometry.dtheta) - odometry.dtheta
     c, s = np.cos(before), np.sin(before)
     x = start_pose[0] + np.cumsum(c * odometry.dx - s * odometry.dy)
@@ -100,11 +120,11 @@ def dead_reckoning(odometry, start_pose):
 
 
 def moments(odometry, params):
-    """Mean [T, 3] and covariance [T, 3, 3] of the intervals' motion (x, y, heading) in the frame
-    at their start: the model of `motion.model`, in closed form.
+    """Mean [T, 3] and covariance [T, 3, 3] of the motion (x, y, heading) in each interval.
 
-    `gain_tran` is left out: it multiplies the result, and may be learnt later. Turning has its
-    gain, since no factor can make up for it.
+    In the robot's frame at its start; `models/motion.py:model` in closed form and NumPy. Without
+    `gain_tran`, a factor of the result that may be learned later; turns have their gain, for which
+    no factor of the result can stand.
     """
     o = odometry
     length = np.hypot(o.dx, o.dy)

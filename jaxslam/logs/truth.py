@@ -1,18 +1,18 @@
-"""True poses at the stamps of a log."""
+"""True poses at any stamp, and the wrapping of angles."""
 
 import numpy as np
 
 
 def wrap(angle):
-    """The angle in [-pi, pi)."""
+    """Wrap angles to [-pi, pi); those already there keep their bits."""
     return angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
 
 
 def truth_at(truth, time, gap=1.0, snap=0.02):
-    """True pose [T, 3] at `time` (int64 ns) [T]; rows of NaN where there is no truth.
+    """Interpolate the true pose [T, 3] at `time` (int64 ns) [T]; NaN where there is no truth.
 
     Linear between neighbouring samples at most `gap` seconds apart, the heading along the shorter
-    turn. Truth of single readings (one per stop) counts for the frames within `snap` seconds.
+    turn. Elsewhere a single reading (one per stop) holds within `snap` seconds.
     """
     time = np.asarray(time, np.int64)
     pose = np.full((time.size, 3), np.nan)

@@ -1,6 +1,6 @@
-"""Values checked as they are taken in: arrays, rows, stamps, numbers; one-line errors.
+"""Check the fields of a log: arrays, rows, stamps, numbers.
 
-Every error names the field, the row, what was found and what is allowed.
+Every error is one line that names the field, the row, the value and what is allowed.
 """
 
 import math
@@ -11,26 +11,26 @@ LAST_STAMP = 1 << 62  # ns; differences of two stamps still fit
 
 
 def assign(owner, name, value):
-    """Set a field of a frozen dataclass while it is being made."""
+    """Set a field of a frozen dataclass under construction."""
     object.__setattr__(owner, name, value)
 
 
 def check_array(where, value, dtype, shape, gaps=False):
-    """`value` as a read-only array, or None; `shape` lists lengths, None where any is allowed.
+    """Convert `value` to a read-only array, or None; `shape` lists lengths, None for any.
 
-    `gaps`: a row may be NaN altogether.
+    `gaps`: whole rows may be NaN. Raises `ValueError`.
     """
     if value is None:
         return None
     try:
-        given = np.asarray(value)
+        source = np.asarray(value)
         with np.errstate(over="ignore"):
-            array = np.array(given, dtype, order="C")
+            array = np.array(source, dtype, order="C")
     except (TypeError, ValueError, OverflowError) as err:
         raise ValueError(f"{where}: is not an array of numbers ({err})") from None
     kinds = "iu" if array.dtype.kind in "iu" else "iuf"
-    if given.dtype.kind not in kinds and given.size:
-        raise ValueError(f"{where}: {given.dtype} is not {array.dtype}")
+    if source.dtype.kind not in kinds and source.size:
+        raise ValueError(f"{where}: {source.dtype} is not {array.dtype}")
     pairs = zip(shape, array.shape, strict=False)
     if array.ndim != len(shape) or any(want not in (None, have) for want, have in pairs):
         wanted = " x ".join("any" if w is None else str(w) for w in shape)
@@ -40,7 +40,7 @@ def check_array(where, value, dtype, shape, gaps=False):
         if gaps:
             good |= np.isnan(array).all(axis=tuple(range(1, array.ndim)), keepdims=True)
         check_rows(where, array, good, "must be finite" + ", or nothing but NaN" * gaps)
-    elif not np.array_equal(array, given):
+    elif not np.array_equal(array, source):
         raise ValueError(f"{where}: values do not fit {array.dtype}")
     array.setflags(write=False)
     return array
@@ -61,7 +61,7 @@ def check_stamps(where, time):
 
 
 def check_number(where, value, least=-math.inf):
-    """`value` as a float; raise for what is no number, not finite or below `least`."""
+    """Convert `value` to a float; raise if it is no number, not finite or below `least`."""
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     if not number or not math.isfinite(value) or value < least:
         raise ValueError(f"{where}: {value!r} is not a finite number of at least {least}")

@@ -23,7 +23,7 @@ _ARCTAN = (
 
 
 def wrap(angle):
-    """Angle in [-pi, pi), rad."""
+    """Wrap an angle to [-pi, pi), rad."""
     return angle - 2 * jnp.pi * jnp.floor(angle * (0.5 / jnp.pi) + 0.5)
 
 
@@ -57,7 +57,7 @@ def direction(y, x):
 
 
 def compose(pose, offset):
-    """Pose of a frame given at `offset` in the frame of `pose`; both (x, y, heading)."""
+    """Compose a pose (x, y, heading) with an offset (x, y, heading) in its frame."""
     x, y, heading = pose
     ox, oy, turn = offset
     c, s = jnp.cos(heading), jnp.sin(heading)
@@ -65,7 +65,7 @@ def compose(pose, offset):
 
 
 def covariance(factor):
-    """L L^T as (xx, xy, yy)."""
+    """Covariance (xx, xy, yy) of a lower factor L: L L^T."""
     l11, l21, l22 = factor
     return l11 * l11, l11 * l21, l21 * l21 + l22 * l22
 
@@ -73,7 +73,7 @@ def covariance(factor):
 def cholesky(xx, xy, determinant):
     """Lower factor of the matrix with top row (xx, xy) and the given determinant.
 
-    The determinant is passed because callers know it without cancellation.
+    The determinant is an argument because callers know it without cancellation.
     """
     l11 = jnp.sqrt(xx)
     return l11, xy / l11, jnp.sqrt(determinant) / l11
@@ -87,9 +87,9 @@ def transpose_times(factor, h):
 
 
 def scalar_update(mean, factor, h, innovation, variance):
-    """Kalman update of N(mean, L L^T) by one scalar measurement, in Carlson's square-root form.
+    """Update N(mean, L L^T) by one scalar measurement, with Carlson's square-root Kalman filter.
 
-    `h` is the measurement's row, `innovation` its value minus its prediction. Returns mean, factor
+    `h`: the measurement's row. `innovation`: its value minus its prediction. Returns mean, factor
     and the innovation's variance. Working through the columns from the last to the first keeps the
     factor lower triangular with a positive diagonal (Carlson 1973, doi:10.2514/3.50253); l21 is
     written so that nothing cancels:
@@ -112,13 +112,13 @@ def scalar_update(mean, factor, h, innovation, variance):
 
 
 def pair_update(mean, factor, rows, innovations, variances):
-    """Kalman update of N(mean, L L^T) by two independent scalars at once: mean, factor, and square
-    and logarithm of the predictive density, which is exp(-(square + logarithm) / 2) / (2 pi).
+    """Update N(mean, L L^T) by two independent scalars at once, with a Kalman filter: mean, factor,
+    and square and logarithm of the predictive density, exp(-(square + logarithm) / 2) / (2 pi).
 
     `rows` g and h, `innovations` at the mean before, `variances` r. With a = L^T g, b = L^T h and
     A = I + a a^T / r1 + b b^T / r2 the mean moves by L z, A z = a v1 / r1 + b v2 / r2, and the new
-    factor is L times the lower factor of A's inverse. Determinants and sums are written out such
-    that nothing cancels, and the square is |z|^2 plus what is left of the innovations. Two
+    factor is L times the lower factor of A's inverse. Determinants and sums are written so that
+    nothing cancels, and the square is |z|^2 plus that of the whitened residuals. Two
     `scalar_update`s give the same; this has half their roots, and what the filter needs more than
     once ends in a division, which XLA does not repeat.
     """

@@ -1,8 +1,9 @@
 """p(pose' | pose, odometry): the paper's translation, then rotation (section III-C, fig. 9).
 
-The heading drifts while the robot translates (`err_drift`), then it rotates (`err_rot`). An
-interval of many small steps keeps the direction of its chord, and its covariance is that of the
-many steps: heading noise that arose early displaces the end sideways, by the lever that was left.
+The heading drifts while the robot translates (`err_drift`), then the robot rotates (`err_rot`). An
+interval of many small steps keeps the direction of its chord, and has the covariance of the many
+steps: heading noise displaces the end sideways, by the lever arm that was still ahead.
+`logs/odometry.py:moments` has the same moments in NumPy.
 """
 
 from typing import NamedTuple
@@ -15,10 +16,10 @@ from jaxslam.models.geometry import wrap
 
 
 class Motion(NamedTuple):
-    """The model of one interval: chord (length, direction), turn, and the noise in its frame.
+    """Model of one interval: chord (`length`, m; direction `chord`, rad), `turn` (rad), and noise.
 
-    The noise is normal: `var_along` the chord; `var_heading`; and sideways `slope` times the
-    heading's noise, plus `var_rest` of its own.
+    The noise is normal: of variance `var_along` (m^2) along the chord and `var_heading` (rad^2);
+    sideways it is `slope` (m) times the heading's, plus independent noise of `var_rest` (m^2).
     """
 
     length: jax.Array
@@ -31,12 +32,12 @@ class Motion(NamedTuple):
 
 
 def model(odometry, params):
-    """`Motion` of one interval, with the systematic gains applied.
+    """`Motion` of one interval of odometry, with the systematic gains applied.
 
     Drift accrues evenly along the chord, so its lever has mean 1/2 and variance 1/12; turning noise
-    has the odometry's. Sideways noise is lever x length x heading noise: the two kinds together
-    have slope cov(side, heading) / var(heading), and what is left of the variance is written as a
-    sum, which can't cancel below zero.
+    has the odometry's lever. Sideways noise is lever x length x heading noise: the two kinds have
+    slope cov(side, heading) / var(heading) together, and the rest of the variance is written as a
+    sum, which cannot cancel below zero.
     """
     o = odometry
     moved = (o.dx != 0) | (o.dy != 0)
@@ -64,7 +65,7 @@ def model(odometry, params):
 
 
 def sample(pose, odometry, params, normals):
-    """Pose after the interval for standard normal draws `normals` (3,); poses (x, y, heading)."""
+    """Move a pose (x, y, heading) by odometry, with the noise of standard normals (3,) (eq. 2)."""
     m = model(odometry, params)
     x, y, heading = pose
     e_along = _root(m.var_along) * normals[0]
@@ -91,7 +92,7 @@ def axes(pose, odometry, params):
 
 
 def log_density(after, before, odometry, params):
-    """log p(after | before, odometry) per m^2 rad; needs noise in every direction (the floors)."""
+    """log p(after | before, odometry) per m^2 rad (eq. 2); needs noise in every direction."""
     m = model(odometry, params)
     c, s = jnp.cos(before[2] + m.chord), jnp.sin(before[2] + m.chord)
     dx, dy = after[0] - before[0], after[1] - before[1]
@@ -104,10 +105,10 @@ def log_density(after, before, odometry, params):
 
 
 def log_density_of(u, odometry, params, drawn_with):
-    """`log_density` of the poses that `sample` made of normals `u` (3,) with `drawn_with`, under
-    `params`: for derivatives by these. Directions without noise under `drawn_with` are left out.
+    """`log_density` under `params` of the poses that `sample` made of normals `u` (3,) under
+    `drawn_with`: for derivatives by `params`. Directions without noise are left out.
 
-    Worked out from the normals: differences of float32 poses would lose small noise.
+    Computed from the normals: differences of float32 poses would lose small noise.
     """
     then, now = model(odometry, drawn_with), model(odometry, params)
     e_heading = _root(then.var_heading) * u[1]

@@ -5,7 +5,7 @@ are written for one particle and one landmark; components may also be arrays tha
 the filter passes all at once. A landmark is its mean, the lower factor of its covariance and, for
 `bearing`, its anchor: `position` and `range_bearing` keep the point in the world (x, y);
 `bearing` keeps (direction, inverse depth) as seen from the anchor, the sensor's position when the
-landmark was created, so that it is a 2-D normal from the first glimpse on (Civera, Davison and
+landmark was begun, so that it is a 2-D normal from the first measurement on (Civera, Davison and
 Montiel 2008, in the plane; given the particle's path the anchor is known exactly).
 """
 
@@ -14,24 +14,28 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
 
+from jaxslam.config import Config
 from jaxslam.models import geometry
 from jaxslam.models.geometry import direction, norm, wrap
 
 LEAST_INVERSE_DEPTH = 1e-3
-TURNING = 0.1  # m/rad: turning makes errors new as so much driving does
-MOST_INFLATION = 1e4  # of a variance, when the robot stands
+TURNING = 0.1  # m/rad: driving that changes errors as much as turning does
+MOST_INFLATION = 1e4  # of a variance, while the robot stands
 LOG_2PI = math.log(2 * math.pi)
 
 
 class Measurements(NamedTuple):
-    """One frame's measurements in K slots (or T frames', stacked).
+    """Up to K measurements of one frame, padded (or of T frames, stacked).
 
-    `value` [K, 2]: (range, bearing), (x, y) or (bearing, 0). `cov` [K, 3]: (xx, xy, yy) of a
-    position, else zero. `identity` [K]: index of a measured identity, -1 if none. `valid` [K].
-    `active` []: whether the sensor looked at all. `scale` [K]: 1 where a position's size rests on
-    odometry, else 0; None: nowhere. `descriptor` [K, J] and `within` [J]: looks and their variance
-    for one landmark (`looks.Space`); None: there are none.
+    `value` [K, 2], m and rad: (range, bearing), (x, y) or (bearing, 0). `cov` [K, 3]: (xx, xy, yy)
+    of a position (m^2), else zero. `identity` [K]: index of a measured identity, -1 if none.
+    `valid` [K]: false for padding. `active` []: whether the sensor measured at all. `scale` [K]: 1
+    where a position's size rests on odometry, else 0 (None: nowhere). `descriptor` [K, J]:
+    appearances, `within` [J]: their variance for one landmark (`logs/appearance_space.py`; None:
+    there are none).
     """
 
     value: jax.Array
@@ -43,13 +47,40 @@ class Measurements(NamedTuple):
     descriptor: jax.Array | None = None
     within: jax.Array | None = None
 
+    @classmethod
+    def from_values(
+        cls,
+        values: ArrayLike,
+        config: Config,
+        cov: ArrayLike | None = None,
+        identity: ArrayLike | None = None,
+    ) -> "Measurements":
+        """`Measurements` of one frame from its n <= K measurements, with padding up to K.
+
+        `values` [n, 2]: (range, bearing) or (x, y); for `bearing` [n]. `cov` [n, 3]: (xx, xy, yy),
+        for `position`. `identity` [n]: from 0, for known association. Raises `ValueError` for
+        more than `config.measurements` values or arrays of other shapes.
+        """
+        values = np.asarray(values, float)
+        n, size = len(values), config.measurements
+        if n > size:
+            raise ValueError(f"values: {n} are more than Config.measurements, {size}")
+        if config.sensor == "bearing":
+            values = np.column_stack([values, np.zeros(n)])
+        padded = np.zeros((size, 2)), np.zeros((size, 3)), np.full(size, -1, np.int32)
+        for array, given in zip(padded, (values, cov, identity), strict=True):
+            if given is not None:
+                array[:n] = given
+        return cls(*padded, valid=np.arange(size) < n, active=np.array(True))
+
 
 class Prediction(NamedTuple):
-    """Prediction of one landmark: its measurement, rows of the Jacobian, noise, where it is.
+    """Predicted measurement of one landmark: `value`, `rows` of its Jacobian by the landmark,
+    `noise` variances; and the landmark's `range` (m) and `bearing` (rad) from the sensor.
 
     `stretch`: for `bearing`, the derivative by the landmark of the logarithm of `ray`'s length.
     With the bearing's row h, the bearing's Hessian is -(stretch h' + h stretch'), but for the
-    curvature of the ray's own direction.
+    curvature of the ray's direction.
     """
 
     value: tuple
@@ -61,10 +92,10 @@ class Prediction(NamedTuple):
 
 
 def apply_position_scale(measurements, params):
-    """The measurements with positions that rest on odometry in true metres: times `gain_tran`.
+    """Multiply positions whose size rests on odometry by `gain_tran`, to true metres.
 
     A triangle over a distance d is as much too small as d is. The covariances stay: the gain is
-    within per cents of 1.
+    within a few per cent of 1.
     """
     if measurements.scale is None:
         return measurements
@@ -73,13 +104,13 @@ def apply_position_scale(measurements, params):
 
 
 def correlated_noise(params, odometry):
-    """`Params` whose measurement noise is that of one independent measurement per correlation.
+    """Inflate the measurement noise of `Params` for errors that are correlated over frames.
 
     Errors that follow a first-order autoregression in the travelled path d have correlation
     exp(-d / correlation) from frame to frame; many such frames tell as much as independent ones
     with coth(d / (2 correlation)) times the variance. Turning counts a little (`TURNING`): a lens's
-    errors change with it, and without any looks a turn in place would lose the heading, which
-    errors that stay alike do not spoil (experiments/correlation.py).
+    errors change with it, and a turn in place without measurements would lose the heading, which
+    constant errors do not spoil (experiments/correlation.py).
     """
     on = params.correlation > 0
     travel = odometry.distance + TURNING * odometry.turn
@@ -91,25 +122,25 @@ def correlated_noise(params, odometry):
 
 
 def sensor_pose_of(pose, params):
-    """The sensor's pose from the robot's."""
+    """Pose of the sensor, from the robot's and the mounting."""
     return geometry.compose(pose, (params.mount_x, params.mount_y, params.mount_yaw))
 
 
 def bearing_variance(r, params):
-    """Variance of a bearing [rad^2] at range `r`: what is seen has a size (`landmark_extent`, m)."""
+    """Variance (rad^2) of a bearing at range `r` (m): landmarks have a size, `landmark_extent`."""
     return params.sigma_bearing**2 + (params.landmark_extent / r) ** 2
 
 
 def ray(sensor_pose, mean, anchor):
-    """A `bearing` landmark from the sensor, in world axes and divided by its depth: (x, y); and its
-    derivatives by direction and by inverse depth, in which latter it is linear."""
+    """Vector (x, y) from the sensor to a `bearing` landmark, in world axes, divided by its depth;
+    and its derivatives by direction and by inverse depth, in which it is linear."""
     c, s = jnp.cos(mean[0]), jnp.sin(mean[0])
     ax, ay = anchor[0] - sensor_pose[0], anchor[1] - sensor_pose[1]
     return (mean[1] * ax + c, mean[1] * ay + s), (-s, c), (ax, ay)
 
 
 def along_ray(point, by_direction, by_depth, depth, heading, params):
-    """`Seen` of what `ray` gave."""
+    """`Prediction` of a `bearing` landmark, from its `ray` and the derivatives."""
     (dx, dy), (tx, ty), (ax, ay) = point, by_direction, by_depth
     q = norm(dx, dy)
     bearing = wrap(direction(dy, dx) - heading)
@@ -122,7 +153,7 @@ def along_ray(point, by_direction, by_depth, depth, heading, params):
 
 
 def observe(sensor, sensor_pose, mean, anchor, params):
-    """`Seen` of a landmark; `noise` holds the variances, and is empty for `position`."""
+    """Predict the measurement of a landmark (eq. 3): `Prediction`; no `noise` for `position`."""
     sx, sy, heading = sensor_pose
     if sensor == "bearing":
         return along_ray(*ray(sensor_pose, mean, anchor), mean[1], heading, params)
@@ -132,7 +163,7 @@ def observe(sensor, sensor_pose, mean, anchor, params):
     if sensor == "position":
         c, s = jnp.cos(heading), jnp.sin(heading)
         return Prediction((c * dx + s * dy, c * dy - s * dx), ((c, s), (-s, c)), (), r, bearing)
-    inverse = 1 / r  # one division: XLA repeats this for everything that is worked out from it
+    inverse = 1 / r  # one division: XLA repeats it in everything that depends on it
     c, s = dx * inverse, dy * inverse
     rows = ((c, s), (-s * inverse, c * inverse))
     noise = (params.sigma_range**2, bearing_variance(r, params))
@@ -140,7 +171,7 @@ def observe(sensor, sensor_pose, mean, anchor, params):
 
 
 def locate(sensor, sensor_pose, value, cov, params):
-    """A new landmark from one measurement: mean, factor, anchor (the inverse of `observe`)."""
+    """Locate a new landmark by one measurement: mean, factor, anchor (inverse of `observe`)."""
     sx, sy, heading = sensor_pose
     anchor = (sx, sy)
     if sensor == "bearing":
@@ -167,7 +198,7 @@ def locate(sensor, sensor_pose, value, cov, params):
 
 
 def log_new_density(sensor, value, params):
-    """log density of measurements of new landmarks: `density_new` per m^2, seen as `value`."""
+    """Log density of measurements `value` of new landmarks, `density_new` of them per m^2."""
     if sensor == "bearing":
         area = params.view_range**2 / 2 + jnp.zeros_like(value[0])
     elif sensor == "position":
@@ -178,11 +209,11 @@ def log_new_density(sensor, value, params):
 
 
 def cap_new_density(params):
-    """The parameters for telling hidden identities apart by bearings alone: no more than one new
-    landmark a frame is expected.
+    """Limit `density_new` of `Params` to one new landmark expected per frame, for unknown data
+    association by bearings alone.
 
-    A bearing has no place. `density_new` over the whole view counts the landmarks that are in the
-    map already, so that where they are dense everything would be new.
+    A bearing fixes no place. `density_new` over the whole view counts landmarks that are in the map
+    already, so that where they are dense everything would be new.
     """
     width = params.view_max - params.view_min
     most = 2 / (width * params.view_range**2)
@@ -190,7 +221,7 @@ def cap_new_density(params):
 
 
 def log_clutter_density(sensor, params):
-    """log density of measurements of nothing: uniform over the view, with probability `outlier`."""
+    """Log density of clutter: uniform over the view, with probability `outlier`."""
     width = params.view_max - params.view_min
     volume = {
         "bearing": width,

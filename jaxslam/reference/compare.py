@@ -1,7 +1,7 @@
-"""The filter beside the NumPy baseline, fed the same draws: agreement, accuracy and time.
+"""Compare the filter with the NumPy baseline on the same draws: agreement, accuracy and time.
 
-In float64 both must take every decision alike and differ by rounding only. In float32 a decision
-that is nearly a tie falls differently sooner or later; from there on they are two honest runs.
+In float64 both must make the same decisions and differ by rounding only. In float32 a near tie is
+decided differently sooner or later; from then on they are two independent runs.
 """
 
 import dataclasses
@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.frames import frames_from_log
+from jaxslam.logs.slicing import select_frames
 from jaxslam.logs.truth import truth_at, wrap
 from jaxslam.models import geometry
 from jaxslam.parameters import Params, default_params
@@ -26,13 +27,14 @@ from jaxslam.results.metrics import ate
 class Agreement(NamedTuple):
     """Both filters over T steps, N particles.
 
-    `same`: steps, from the first on, with equal ancestors and associations of all particles.
-    Largest absolute differences: of `pose` [m, rad] and `log_weight` over these steps, all
-    particles; of `landmarks` (means and covariances) and `births`, at the end (inf where only one
-    has a landmark; NaN when `same` < T). Counted in the baseline: steps that `resampled`; landmarks
-    `born`, `freed` and lost in `overflow`, per particle; measurements that were `clutter`, per
-    particle. Mean poses [T, 3] and seconds of both, `compile_seconds` apart, and the map of the
-    baseline's best particle.
+    - `same`: how many first steps have equal ancestors and associations of all particles.
+    - Largest absolute differences over these steps and all particles of `pose` [m, rad] and
+      `log_weight`; of `landmarks` (means and covariances) at the end (inf if only one filter has a
+      landmark; NaN if `same` < T).
+    - Counts in the baseline: steps `resampled`; per particle landmarks `begun`, `forgotten` and
+      lost in `overflow`, and measurements taken for `clutter`.
+    - Mean poses [T, 3] and seconds of both, without `compile_seconds`; `map_baseline` of the
+      baseline's best particle.
     """
 
     steps: int
@@ -42,8 +44,8 @@ class Agreement(NamedTuple):
     log_weight: float
     landmarks: float
     resampled: int
-    born: float
-    freed: float
+    begun: float
+    forgotten: float
     overflow: float
     clutter: float
     pose_baseline: np.ndarray
@@ -55,15 +57,15 @@ class Agreement(NamedTuple):
 
 
 class PointMap(NamedTuple):
-    """World points `mean` [L, 2], m, and the log's `identity` [L] (-1: hidden)."""
+    """World points `mean` [L, 2], m, and the log's `identity` [L] (-1: unknown)."""
 
     mean: np.ndarray
     identity: np.ndarray
 
 
 class Comparison(NamedTuple):
-    """One particle count: `double` and `single` precision, and unaligned ATE [m] of both filters
-    in single precision (NaN without truth)."""
+    """Agreement in `double` and `single` precision, and unaligned ATE [m] of both filters in single
+    precision (NaN without truth), for one number of particles."""
 
     double: Agreement
     single: Agreement
@@ -72,11 +74,11 @@ class Comparison(NamedTuple):
 
 
 def compare(log, config, params=None, seed=0, steps=200, every=None, progress=None):
-    """`Comparison` over `steps` of the log's frames, every `every`-th from the first on.
+    """Compare both filters over `steps` frames of the log, every `every`-th from the first on.
 
-    `every`: None to cover a tenth of the log, or as much as there is. `progress`: as for
-    `agreement`, which is run in float64 and in float32. The baseline has no other proposal than
-    the prior and takes no notice of looks, so the filter does as it does.
+    Returns a `Comparison`. `every` None: cover a tenth of the log, if possible. `progress`: as for
+    `agreement`, which is run in float64 and in float32. The baseline has only the prior proposal
+    and no appearance, so the filter is configured likewise.
     """
     config = dataclasses.replace(config, proposal="prior", rejuvenate=0.0, descriptors=0)
     log = select_frames(log, thin(log, steps, every))
@@ -88,18 +90,19 @@ def compare(log, config, params=None, seed=0, steps=200, every=None, progress=No
 
 
 def thin(log, steps, every=None):
-    """Numbers of `steps` frames, every `every`-th from the first on (None: over a tenth)."""
+    """Numbers of `steps` frames, every `every`-th from the first on (None: a tenth of the log)."""
     if every is None:
         every = max(1, len(log.frame_time) // (10 * steps))
     return np.arange(0, len(log.frame_time), every)[:steps]
 
 
 def agreement(log, config, params=None, seed=0, steps=None, double=True, progress=None):
-    """`Agreement` over the log's first `steps` frames (None: all).
+    """Run both filters over the log's first `steps` frames (None: all); returns `Agreement`.
 
     `double`: the filter in float64, without changing JAX's global settings; otherwise in float32.
-    The baseline is in float64 always, and gets the filter's draws. `progress`: called with
-    (done, total), first with (0, total) before compiling.
+    The baseline is always in float64, and gets the filter's draws. `progress`: called with
+    (done, total), first with (0, total) before compiling. Raises `ValueError` for a `config` that
+    the baseline can't follow.
     """
     if config.proposal != "prior" or config.association == "sampled":
         raise ValueError(
@@ -109,12 +112,10 @@ def agreement(log, config, params=None, seed=0, steps=None, double=True, progres
     params = Params(*map(float, params))
     if steps is not None:
         log = select_frames(log, np.arange(min(steps, len(log.frame_time))))
-    data = frames_from_log(
-        log, config.sensor, config.measurements, params, config.association == "known"
-    )
+    data = frames_from_log(log, config, params)
     if progress:
         progress(0, len(data.time))
-    # The runner's local origin: float32 has 7 digits.
+    # A local origin, as in runs: float32 has 7 digits.
     origin = np.array([*log.start_pose[:2], 0.0])
     start = log.start_pose - origin
     with jax.enable_x64(double):
@@ -130,8 +131,8 @@ def agreement(log, config, params=None, seed=0, steps=None, double=True, progres
         config.particles,
         *_differences(state, trace, reference),
         resampled=int(reference.resampled.sum()),
-        born=float(reference.births.sum() / config.particles),
-        freed=float(reference.freed.sum() / config.particles),
+        begun=float(reference.births.sum() / config.particles),
+        forgotten=float(reference.freed.sum() / config.particles),
         overflow=float(reference.overflow.sum() / config.particles),
         clutter=float((reference.match == baseline.CLUTTER).sum() / config.particles),
         pose_baseline=reference.pose_mean + origin,
@@ -139,40 +140,21 @@ def agreement(log, config, params=None, seed=0, steps=None, double=True, progres
         seconds_baseline=spent,
         seconds_filter=ran,
         compile_seconds=compiled,
-        map_baseline=_baseline_map(reference, params, config, data.identities, origin),
-    )
-
-
-def select_frames(log, kept):
-    """The log with only these frames (increasing numbers [F]): a slower sensor, the same drive."""
-    number = np.full(len(log.frame_time), -1)
-    number[kept] = np.arange(len(kept))
-    rows = number[log.frame] >= 0
-    columns = ("bearing", "bearing_sigma", "range", "point", "point_cov", "point_baseline")
-    columns += ("identity", "descriptor")
-    truth = log.truth
-    if truth is not None and truth.identity is not None:
-        truth = dataclasses.replace(truth, identity=truth.identity[rows])
-    return dataclasses.replace(
-        log,
-        frame_time=log.frame_time[kept],
-        frame=number[log.frame[rows]],
-        truth=truth,
-        **{n: getattr(log, n)[rows] for n in columns if getattr(log, n) is not None},
+        map_baseline=_map_of_best(reference, params, config, data.identities, origin),
     )
 
 
 def table(comparisons):
-    """Text: one column per `Comparison`."""
+    """Format a table as text, with a column per `Comparison`."""
     rows = [
         ("", "{0.particles} particles"),
-        ("float64: decisions alike", "{0.same} of {0.steps} steps"),
+        ("float64: same decisions", "{0.same} of {0.steps} steps"),
         ("  largest difference, poses", "{0.pose:.1e} m, rad"),
         ("  log weights", "{0.log_weight:.1e}"),
         ("  landmarks at the end", "{0.landmarks:.1e}"),
         ("  resampled", "{0.resampled} steps"),
-        ("  landmarks born, forgotten", "{0.born:.1f}, {0.freed:.1f}"),
-        ("float32: decisions alike", "{1.same} of {1.steps} steps"),
+        ("  landmarks begun, forgotten", "{0.begun:.1f}, {0.forgotten:.1f}"),
+        ("float32: same decisions", "{1.same} of {1.steps} steps"),
         ("  largest difference, poses", "{1.pose:.1e} m, rad"),
         ("path error, baseline", "{2.ate_baseline:.3f} m RMSE"),
         ("path error, filter", "{2.ate_filter:.3f} m RMSE"),
@@ -200,8 +182,8 @@ def _times(row):
 
 
 class _Trace(NamedTuple):
-    """Every step's poses [T, 3, N], log weights [T, N], ancestors [T, N], births matched [T, K, N]
-    and mean pose [T, 3]."""
+    """Every step's poses [T, 3, N], log weights [T, N], ancestors [T, N], landmark ids matched
+    [T, K, N] and mean pose [T, 3]."""
 
     pose: np.ndarray
     log_weight: np.ndarray
@@ -211,7 +193,7 @@ class _Trace(NamedTuple):
 
 
 @partial(jax.jit, static_argnames="config")
-def _steps(key, state, odometry, measurements, params, config):
+def _scan_steps(key, state, odometry, measurements, params, config):
     def body(state, frame):
         state, info = fastslam.step(key, state, *frame, params, config)
         kept = state.pose, state.log_weight, info.ancestors, info.landmark_id, info.estimate.mean
@@ -221,12 +203,12 @@ def _steps(key, state, odometry, measurements, params, config):
 
 
 def _run_filter(data, config, params, seed, start, log):
-    """Final state, `_Trace`, draws for the baseline, seconds to compile and to run."""
+    """Run the filter: final state, `_Trace`, draws for the baseline, seconds to compile and run."""
     key = jax.random.key(seed)
     state = fastslam.init(config, key, start, log.start_cov)
     given = jax.tree.map(jnp.asarray, (data.odometry, data.measurements, params))
     begin = time.perf_counter()
-    steps = _steps.lower(key, state, *given, config).compile()
+    steps = _scan_steps.lower(key, state, *given, config).compile()
     compiled = time.perf_counter()
     jax.block_until_ready(steps(key, state, *given))  # to warm up
     begin, compiled = time.perf_counter(), compiled - begin
@@ -240,24 +222,24 @@ def _run_filter(data, config, params, seed, start, log):
     return *host, compiled, ran
 
 
-def _baseline_map(reference, params, config, identities, origin):
+def _map_of_best(reference, params, config, identities, origin):
     """`PointMap` of the best particle's landmarks that are confirmed and have a depth."""
-    # After resampling all weights are equal: the best particle lives on in its first child.
-    heir = int(np.argmax(reference.ancestors[-1] == reference.best[-1]))
-    particle = reference.particles[heir]
-    points, names = [], []
-    for slot, mark in enumerate(particle.landmarks):
-        if mark is None or (config.forgetting and mark.log_odds < params.existence_confirm):
+    # After resampling all weights are equal: take the first child of the best particle.
+    child = int(np.argmax(reference.ancestors[-1] == reference.best[-1]))
+    particle = reference.particles[child]
+    points, ids = [], []
+    for slot, landmark in enumerate(particle.landmarks):
+        if landmark is None or (config.forgetting and landmark.log_odds < params.existence_confirm):
             continue
-        if config.sensor == "bearing" and not mark.mean[1] > 3 * np.sqrt(mark.cov[1, 1]):
+        if config.sensor == "bearing" and not landmark.mean[1] > 3 * np.sqrt(landmark.cov[1, 1]):
             continue  # no depth
-        points.append(ekf.point_of(mark, config.sensor)[0] + origin[:2])
-        names.append(identities[slot] if slot < len(identities) else -1)
-    return PointMap(np.reshape(points, (-1, 2)), np.array(names, np.int64))
+        points.append(ekf.point_of(landmark, config.sensor)[0] + origin[:2])
+        ids.append(identities[slot] if slot < len(identities) else -1)
+    return PointMap(np.reshape(points, (-1, 2)), np.array(ids, np.int64))
 
 
 def _differences(state, trace, reference):
-    """`same`, `pose`, `log_weight` and `landmarks` of `Agreement`."""
+    """Fields `same`, `pose`, `log_weight` and `landmarks` of `Agreement`."""
     equal = (trace.ancestors == reference.ancestors).all(1)
     equal &= (np.swapaxes(trace.landmark_id, 1, 2) == reference.landmark_id).all((1, 2))
     total = len(equal)
@@ -274,7 +256,7 @@ def _differences(state, trace, reference):
 
 
 def _map_difference(world, particles):
-    """Largest difference of any number of any landmark of any particle; inf: not the same ones."""
+    """Largest difference in any landmark of any particle; inf if they have different landmarks."""
     cov = np.stack(geometry.covariance(world.factor.astype(float)))
     largest = 0.0
     for i, particle in enumerate(particles):
@@ -283,8 +265,8 @@ def _map_difference(world, particles):
         )
         slots = np.flatnonzero(world.count[:, i])
         slots = slots[np.argsort(world.landmark_id[slots, i])]
-        births = [(m.landmark_id, m.count) for m in marks]
-        if births != list(zip(world.landmark_id[slots, i], world.count[slots, i], strict=True)):
+        ids = [(m.landmark_id, m.count) for m in marks]
+        if ids != list(zip(world.landmark_id[slots, i], world.count[slots, i], strict=True)):
             return np.inf
         for slot, landmark in zip(slots, marks, strict=True):
             (xx, xy), (_, yy) = landmark.cov
@@ -293,6 +275,6 @@ def _map_difference(world, particles):
             pairs += (
                 [(world.log_odds[None], landmark.log_odds)] if world.log_odds is not None else []
             )
-            for mine, other in pairs:
-                largest = max(largest, float(np.abs(mine[:, slot, i] - other).max()))
+            for values, other in pairs:
+                largest = max(largest, float(np.abs(values[:, slot, i] - other).max()))
     return largest

@@ -1,8 +1,8 @@
-"""The baseline's landmarks: one 2 x 2 EKF each, for the three sensors, in plain NumPy.
+"""The landmarks of the reference: one 2 x 2 EKF each, for the three sensors, in plain NumPy.
 
 A landmark is a point (x, y) in the world; for the sensor `bearing` it is (direction phi, inverse
-depth rho) seen from `anchor`, where the sensor stood when it first saw it. Textbook equations in
-covariance form, float64, importing nothing of the filter: see `baseline`. `s` is the sensor's pose
+depth rho) from `anchor`, the sensor's position when it was first seen. Textbook equations in
+covariance form, float64, importing nothing of the filter: see `fastslam`. `s` is the sensor's pose
 in the world [3], `model` the filter's `Params` and `Config` in one record.
 """
 
@@ -19,26 +19,26 @@ PARTS, APART = 5, 0.75  # narrower normals a bearing landmark is split into; var
 
 @dataclass(eq=False)
 class Landmark:
-    """One landmark's EKF, a factor of the paper's eq. 6; an empty slot holds None instead."""
+    """The EKF of one landmark, a factor of the paper's eq. 6; None in an empty slot."""
 
     mean: np.ndarray  # [2]
     cov: np.ndarray  # [2, 2]
     anchor: np.ndarray  # [2] world, m
-    count: int  # times matched, the birth included
+    count: int  # measurements, the first included
     log_odds: float  # of its existence
     landmark_id: int  # frame * K + measurement
 
 
 class Prediction(NamedTuple):
-    value: np.ndarray  # [d] what the sensor should read
-    jacobian: np.ndarray  # [d, 2] its derivative by the landmark
+    value: np.ndarray  # [d] expected measurement
+    jacobian: np.ndarray  # [d, 2] derivative of the value by the landmark
     bearing: float  # sensor frame
     range: float  # m
     hessian: np.ndarray | None = None  # [2, 2] of a lone bearing
 
 
 def wrap(angle):
-    """The angle in [-pi, pi)."""
+    """Wrap an angle to [-pi, pi)."""
     return angle - 2 * math.pi * np.floor((angle + math.pi) / (2 * math.pi))
 
 
@@ -48,15 +48,15 @@ def rotation(angle):
 
 
 def sensor_pose(pose, model):
-    """Where the sensor is in the world [3], from the robot's pose and the mounting."""
+    """Sensor pose in the world [3], from the robot's pose and the mounting."""
     xy = pose[:2] + rotation(pose[2]) @ [model.mount_x, model.mount_y]
     return np.append(xy, pose[2] + model.mount_yaw)
 
 
 def predict(landmark, s, model, centre=None):
-    """The measurement expected at s (paper, eq. 3), linearised at the landmark's mean.
+    """Predict the measurement at s (paper, eq. 3), linearised at the landmark's mean.
 
-    For `bearing` the unit vector of the direction phi is linear about `centre` (None: the mean's).
+    For `bearing` the unit vector of the direction phi is linearised at `centre` (None: the mean).
     """
     if model.sensor == "bearing":
         phi, rho = landmark.mean
@@ -81,7 +81,7 @@ def predict(landmark, s, model, centre=None):
 
 
 def noise(r, measurement, model):
-    """R [d, d] at range r, which is negative for an inverse depth beyond infinity.
+    """Measurement noise R [d, d] at range r, which is negative for a negative inverse depth.
 
     `position` has the paper's 2-D normal error (section III-B.3).
     """
@@ -94,7 +94,7 @@ def noise(r, measurement, model):
 
 
 def innovation(landmark, measurement, expected, model):
-    """Measured minus predicted nu [d], its covariance S = H P H' + R and log N(nu; 0, S).
+    """Innovation nu [d], measured minus predicted; its covariance S = H P H' + R; log N(nu; 0, S).
 
     The density is p(z | x, M) of the paper's eq. 3 with the landmark integrated out. A lone bearing
     is predicted to second order in the landmark.
@@ -116,8 +116,8 @@ def innovation(landmark, measurement, expected, model):
 def update(landmark, measurement, s, model):
     """Correct one landmark in place (paper, eq. 5 for one factor of eq. 6).
 
-    Returns the log predictive density of the measurement: what it adds to the particle's weight.
-    For `bearing` it is that of a mixture: a normal each for near, middling and far.
+    Returns the log predictive density of the measurement, which is added to the log weight. For
+    `bearing` it is that of a mixture of normals from near to far.
     """
     if model.sensor == "bearing":
         shares, parts = zip(*apart(landmark), strict=True)
@@ -134,7 +134,7 @@ def update(landmark, measurement, s, model):
 
 
 def correct(landmark, measurement, s, model, centre=None):
-    """The Kalman update in place, and the measurement's log density."""
+    """Perform the Kalman update in place; returns the measurement's log density."""
     expected = predict(landmark, s, model, centre)
     nu, nu_cov, log_density = innovation(landmark, measurement, expected, model)
     gain = landmark.cov @ expected.jacobian.T @ np.linalg.inv(nu_cov)
@@ -145,7 +145,7 @@ def correct(landmark, measurement, s, model, centre=None):
 
 
 def apart(landmark):
-    """(weight, Landmark) of narrower normals in a row along inverse depth, which together have the
+    """Yield (weight, Landmark) of narrower normals along inverse depth, which together have the
     landmark's mean and covariance: Gauss-Hermite points, and the rest of the variance in each."""
     points, weights = np.polynomial.hermite_e.hermegauss(PARTS)
     step = landmark.cov[:, 1] / math.sqrt(landmark.cov[1, 1])
@@ -156,7 +156,7 @@ def apart(landmark):
 
 
 def merge(landmark, weights, parts):
-    """Give the landmark the mean and covariance of the mixture of `parts`."""
+    """Set the landmark's mean and covariance to those of the mixture of `parts`."""
     means = np.array([part.mean for part in parts])
     landmark.mean = weights @ means
     between = (means - landmark.mean).T @ np.diag(weights) @ (means - landmark.mean)
@@ -165,7 +165,7 @@ def merge(landmark, weights, parts):
 
 
 def create(measurement, s, landmark_id, model):
-    """A landmark seen for the first time, from sensor pose s [3]."""
+    """Begin a landmark from its first measurement, at sensor pose s [3]."""
     if model.sensor == "bearing":
         mean = np.array([s[2] + measurement.value[0], model.inv_depth_mean])
         var_phi = model.sigma_bearing**2 + (model.landmark_extent * model.inv_depth_mean) ** 2

@@ -1,8 +1,8 @@
-"""FastSLAM 1.0 in plain NumPy, one particle at a time: the yardstick the JAX filter is held to.
+"""FastSLAM 1.0 in plain NumPy, one particle at a time: the reference of the JAX filter.
 
-Written straight from the paper (section III) as a person would: loops over particles, measurements
-and landmarks, float64. It imports nothing of the filter, so that an error has to be made twice, in
-two ways, to go unseen. SI units, radians, counter-clockwise, x forward.
+Written directly from the paper (section III): loops over particles, measurements and landmarks,
+float64. It imports nothing of the filter, so that an error would have to be made twice, in two
+ways, to stay undetected. SI units, radians, counter-clockwise, x forward.
 """
 
 import copy
@@ -16,7 +16,7 @@ import numpy as np
 from jaxslam.reference import ekf
 
 NEW, CLUTTER, PADDING = -1, -2, -3
-MOST_DULLED = 1e4  # most that a variance grows by for a robot that stands
+MOST_DULLED = 1e4  # largest factor of a variance, when the robot stands
 
 
 @dataclass(eq=False)
@@ -29,8 +29,8 @@ class Particle:
 
 
 class BaselineResult(NamedTuple):
-    """One row per step. `poses` and `log_weight` are in the order of the particles after the step's
-    resampling, `best`, `match`, `slot`, `births`, `freed` and `overflow` in the order before it."""
+    """One row per step. Particles are in the order after the step's resampling in `poses` and
+    `log_weight`, and before it in `best`, `match`, `slot`, `births`, `freed` and `overflow`."""
 
     pose_mean: np.ndarray  # [T, 3]
     cov: np.ndarray  # [T, 3, 3]
@@ -43,26 +43,26 @@ class BaselineResult(NamedTuple):
     degenerate: np.ndarray  # [T] no particle had a finite weight
     match: np.ndarray  # [T, N, K] slot, or -1 new, -2 clutter, -3 padding
     slot: np.ndarray  # [T, N, K] slot matched or created, -1 none
-    landmark_id: np.ndarray  # [T, N, K] as match, but the landmark's birth instead of its slot
+    landmark_id: np.ndarray  # [T, N, K] as match, but the landmark id instead of its slot
     held: np.ndarray  # [T, M] slots that some particle used, before the step's resampling
-    births: np.ndarray  # [T, N] landmarks created
+    births: np.ndarray  # [T, N] new landmarks
     freed: np.ndarray  # [T, N] landmarks forgotten
-    overflow: np.ndarray  # [T, N] landmarks lost for want of a slot
+    overflow: np.ndarray  # [T, N] landmarks lost because no slot was free
     poses: np.ndarray  # [T, 3, N]
     log_weight: np.ndarray  # [T, N]
     particles: list  # of Particle, after the last step
 
 
 def numbers(record):
-    """The fields of a NamedTuple or of a plain object, as float64 arrays."""
+    """Convert the fields of a NamedTuple or of a plain object to float64 arrays, by name."""
     fields = record._asdict() if hasattr(record, "_asdict") else vars(record)
     return {name: np.asarray(value, float) for name, value in fields.items()}
 
 
 def make_model(params, config):
-    """Params' numbers and Config's choices as one record; without clutter nothing is an outlier.
+    """Merge `Params` and `Config` into one record; without clutter `outlier` is 0.
 
-    Bearings are as noisy as they are with `extra_bearing_noise` rad of further, independent error.
+    `sigma_bearing` includes `extra_bearing_noise` [rad], an independent error.
     """
     values = {name: float(value) for name, value in numbers(params).items()}
     model = SimpleNamespace(**values | vars(config))
@@ -73,7 +73,7 @@ def make_model(params, config):
 
 
 def start(pose, cov, normals, slots):
-    """Particles around the start pose: pose + L n with L L' = cov [3, 3], every map empty.
+    """Draw particles around the start pose: pose + L n with L L' = cov [3, 3]; all maps are empty.
 
     L is the Cholesky factor of a positive definite cov, else V sqrt(max(w, 0)).
     """
@@ -90,7 +90,7 @@ def start(pose, cov, normals, slots):
 def move(pose, o, normals, model):
     """Draw from p(x_k | x_{k-1}, u_k): the paper's eq. 2 and section III-C (fig. 9).
 
-    `o`: odometry dx, dy, dtheta in the robot's frame at the interval's start, and what was driven.
+    `o`: a step of `Odometry`, in the robot's frame at the interval's start.
     """
     length = math.hypot(o.dx, o.dy)
     chord = math.atan2(o.dy, o.dx) if length > 0 else 0.0
@@ -115,7 +115,7 @@ def move(pose, o, normals, model):
 
 
 def alternatives(measurement, model):
-    """Log weight of the measurement being of a new landmark, and of its being clutter."""
+    """Log weights of a measurement as a new landmark and as clutter."""
     width, reach = model.view_max - model.view_min, model.view_range
     if model.sensor == "range_bearing":
         area, volume = measurement.value[0], width * reach
@@ -124,14 +124,14 @@ def alternatives(measurement, model):
     else:
         area, volume = reach**2 / 2, width
         if model.association == "maximum_likelihood":
-            # A bearing has no place: at most one new landmark a frame is expected.
+            # A bearing has no position: at most one new landmark per frame is expected.
             area = min(area, 1 / (width * model.density_new))
     new = np.log(1 - model.outlier) + np.log(model.density_new * area)
     return new, np.log(model.outlier) - np.log(volume) if model.clutter else -np.inf
 
 
 def score_table(particle, frame, s, model):
-    """Log weight of each measurement [row] coming from each slot [M], -inf where it is empty."""
+    """Log weight of each measurement [row] as one of each slot [M], -inf where it is empty."""
     table = np.full((len(frame), len(particle.landmarks)), -np.inf)
     for slot, landmark in enumerate(particle.landmarks):
         if landmark is None:
@@ -146,7 +146,7 @@ def score_table(particle, frame, s, model):
 def associate_likeliest(table, new, clutter, exclusive):
     """Maximum likelihood for every measurement (paper, eq. 6 and section III-D): slot per row.
 
-    Pairs better than both alternatives are served best first; if `exclusive`, no slot twice.
+    Pairs better than both alternatives are taken best first; if `exclusive`, no slot twice.
     """
     choice = [NEW if n >= c else CLUTTER for n, c in zip(new, clutter, strict=True)]
     pairs = [tuple(pair) for pair in np.argwhere(table > np.maximum(new, clutter)[:, None])]
@@ -160,7 +160,7 @@ def associate_likeliest(table, new, clutter, exclusive):
 
 
 def associate_known(particle, frame, table, clutter):
-    """Identity i lives in slot i; only the reading of a landmark already there can be clutter."""
+    """Match identity i to slot i; only a measurement of a landmark in the map can be clutter."""
     choice = []
     for row, measurement in enumerate(frame):
         i = measurement.identity
@@ -172,14 +172,15 @@ def associate_known(particle, frame, table, clutter):
 
 
 def free_slot(particle, measurement, free, model):
-    """The slot a new landmark gets: its identity's, else the next of `free`; -1 if none is."""
+    """Slot for a new landmark: its identity's, else the next of `free`; -1 if there is none."""
     if model.association == "known":
         return measurement.identity if measurement.identity < len(particle.landmarks) else -1
     return next(free, -1)
 
 
 def forget(particle, before, matched, s, model):
-    """Seen raises a landmark's log-odds, expected and not seen lowers it. Returns slots freed."""
+    """Raise the existence log-odds of measured landmarks, lower those of expected but missed ones,
+    and drop landmarks below zero. Returns how many."""
     freed = 0
     for slot in before:
         landmark = particle.landmarks[slot]
@@ -197,11 +198,11 @@ def forget(particle, before, matched, s, model):
 
 
 def with_extra_noise(model, o):
-    """The model for measurements whose errors live on over `correlation` metres of path, a radian
-    of turning counting as a tenth of a metre.
+    """Increase the noise for errors correlated over `correlation` metres of path; a radian of turn
+    counts as 0.1 m.
 
-    An AR(1) process with e-folding path L, read every d: its mean over many reads has the variance
-    of white reads (1 + a) / (1 - a) times as noisy, with a = exp(-d / L).
+    An AR(1) process with e-folding path L, sampled every d: the mean of many samples has the
+    variance of white noise of (1 + a) / (1 - a) times the variance, with a = exp(-d / L).
     """
     if model.correlation == 0:
         return model
@@ -215,11 +216,11 @@ def with_extra_noise(model, o):
 
 
 def correct(particle, frame, columns, index, model, dull, held):
-    """All measurements of frame number `index`: associate, weigh, update, create, forget.
+    """Process all measurements of frame `index`: associate, weigh, update, create, forget.
 
-    Paper, section III-D. Changes the particle in place; returns match [K], slot [K], birth [K],
-    slots freed. `dull`: the model of what is seen again, from which less is new than in `model`.
-    `held` [M]: slots that no new landmark may take, since some particle uses them.
+    Paper, section III-D. Changes the particle in place; returns match [K], slot [K], landmark id
+    [K] and how many landmarks were forgotten. `dull`: the model with correlated noise, for
+    landmarks measured again. `held` [M]: slots in use by some particle, not for new landmarks.
     """
     free = iter(np.flatnonzero(~held).tolist())
     s = ekf.sensor_pose(particle.pose, model)
@@ -253,12 +254,12 @@ def correct(particle, frame, columns, index, model, dull, held):
 
 
 def in_use(particles):
-    """Slots [M] in which some particle holds a landmark."""
+    """Mask [M] of slots in which some particle has a landmark."""
     return np.array([[m is not None for m in p.landmarks] for p in particles]).any(0)
 
 
 def normalise(particles):
-    """Make the weights sum to one; the sum is the step's evidence, eq. 5's denominator."""
+    """Normalize the weights; their sum is the step's evidence, the denominator of eq. 5."""
     weights = np.array([particle.log_weight for particle in particles])
     lost = ~np.isfinite(weights)
     weights[lost] = -np.inf
@@ -274,7 +275,7 @@ def normalise(particles):
 
 
 def estimate(particles, weights):
-    """Weighted mean, with the circular mean of the headings, covariance, heaviest particle, ESS."""
+    """Weighted mean (circular for headings), covariance, heaviest particle and ESS."""
     weight, pose = weights / weights.sum(), np.array([p.pose for p in particles])
     mean = weight @ pose
     mean[2] = math.atan2(weight @ np.sin(pose[:, 2]), weight @ np.cos(pose[:, 2]))
@@ -285,7 +286,7 @@ def estimate(particles, weights):
 
 
 def resample(particles, weights, uniform):
-    """Systematic: child i copies the first particle j with c_j > (i + uniform) / N, map and all."""
+    """Resample systematically: child i copies the first particle j with c_j > (i + uniform) / N."""
     count, c = len(weights), np.cumsum(weights) / np.sum(weights)
     last = int(np.flatnonzero(weights)[-1])  # in case rounding takes (i + u) / N up to c's end
     ancestors = [min(int(np.sum(c <= (i + uniform) / count)), last) for i in range(count)]
@@ -296,17 +297,17 @@ def resample(particles, weights, uniform):
 
 
 def map_of(particle, sensor):
-    """The particle's map as a list of (slot, mean [2], covariance [2, 2]), world, m."""
+    """The particle's map: a list of (slot, mean [2], covariance [2, 2]), world, m."""
     landmarks = [(i, mark) for i, mark in enumerate(particle.landmarks) if mark is not None]
     return [(slot, *ekf.point_of(landmark, sensor)) for slot, landmark in landmarks]
 
 
 def read_frame(measurements, t, model):
-    """The valid measurements of frame t, in order, each with k, value [d], cov and identity."""
+    """Read the valid measurements of frame t, in order, each with k, value [d], cov, identity."""
     frame, scale = [], getattr(measurements, "scale", None)
     for k in np.flatnonzero(np.asarray(measurements.valid[t])):
         value = np.array(measurements.value[t][k], float)[: 1 if model.sensor == "bearing" else 2]
-        if scale is not None and scale[t][k]:  # a position as much too small as the odometry is
+        if scale is not None and scale[t][k]:  # a position triangulated from odometry
             value *= model.gain_tran
         xx, xy, yy = np.array(measurements.cov[t][k], float)
         cov, identity = np.array([[xx, xy], [xy, yy]]), int(measurements.identity[t][k])
@@ -317,10 +318,10 @@ def read_frame(measurements, t, model):
 
 
 def step(particles, odometry, frame, columns, index, normals, uniform, model, held=None):
-    """One step of FastSLAM (paper, eqs. 4 and 5): the new particles, and a row of the result.
+    """Perform one step of FastSLAM (paper, eqs. 4 and 5): new particles, and a row of the result.
 
-    `frame` is None when the sensor did not look: then the robot moves, and nothing else happens.
-    `held` [M]: the slots in use (that row's of the step before; None: as the particles have it).
+    `frame` None: no measurement, the robot only moves. `held` [M]: the slots in use, from the row
+    of the step before (None: those of the particles).
     """
     held = in_use(particles) if held is None else held
     for particle, n in zip(particles, normals.T, strict=True):
@@ -363,10 +364,10 @@ def run(
     first_step=0,
     progress=None,
 ):
-    """The whole log, its randomness given: start_normals [3, N], normals [T, 3, N], uniforms [T].
+    """Filter a log with the random draws start_normals [3, N], normals [T, 3, N], uniforms [T].
 
-    Everything is read by attribute, so the filter's own types do, and so do plain ones.
-    `first_step`: number of the first frame. `progress(done, total)` is called after every step.
+    Inputs are read by attribute: the filter's types or plain objects. `first_step`: number of the
+    first frame. `progress(done, total)` is called after every step.
     """
     model, rows, drive = make_model(params, config), [], numbers(odometry)
     given = [np.asarray(part, float) for part in (start_pose, start_cov, start_normals)]

@@ -3,6 +3,7 @@
 import json
 import tomllib
 import zlib
+from dataclasses import MISSING, fields
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -14,11 +15,11 @@ from jaxslam.parameters import Params, current_names
 from jaxslam.results.figures import draw_figures
 from jaxslam.results.metrics import compute_errors
 from jaxslam.results.result import MapEstimate, Result
-from jaxslam.results.run_folder import COLUMNS, FILE_NAMES, LOOKING_BACK, MAYBE
+from jaxslam.results.run_folder import FILE_NAMES, SMOOTHED
 from jaxslam.smoother.genealogy import Ancestral, Lineage
 
 
-def load_result(directory, log=None):
+def load_result(directory: str | Path, log: str | Path | None = None) -> Result:
     """The `Result` saved in a run's folder. `log`: where its log is now, if it was moved.
 
     Raises `ValueError` if a file is missing or broken, or if the log isn't the run's.
@@ -34,10 +35,13 @@ def load_result(directory, log=None):
         ):
             names = {stored: name for name, stored in FILE_NAMES.items()}
             steps = {names.get(stored, stored): archive[stored] for stored in archive.files}
-            columns = {name: steps[name] for name in COLUMNS}
+            columns = {
+                f.name: steps[f.name]
+                for f in fields(Result)
+                if f.metadata and (f.name in steps or f.default is MISSING)
+            }
             landmarks = MapEstimate(**_columns_of("map", steps))
             columns |= _smoother_columns(steps)
-            columns |= {name: steps[name] for name in MAYBE if name in steps}
         seed, source = told["seed"], told["log"]
         spent = {name: summary[name] for name in ("seconds", "compile_seconds", "dropped")}
         spent["refine_seconds"] = summary.get("refine_seconds")
@@ -47,11 +51,13 @@ def load_result(directory, log=None):
         ) from None
     except (OSError, KeyError, TypeError, ValueError, EOFError, BadZipFile, zlib.error) as error:
         raise ValueError(f"{directory}: a broken run's folder ({error}); run it again") from error
-    log = _find_log(directory, source) if log is None else load_log(log)
-    if not np.isin(columns["time"], log.frame_time).all():
-        raise ValueError(f"{directory}: {log.name} is not the log of this run (frame times differ)")
+    used = _find_log(directory, source) if log is None else load_log(log)
+    if not np.isin(columns["time"], used.frame_time).all():
+        raise ValueError(
+            f"{directory}: {used.name} is not the log of this run (frame times differ)"
+        )
     return Result(
-        log=log,
+        log=used,
         config=config,
         params=params,
         seed=seed,
@@ -70,7 +76,7 @@ def _columns_of(name, steps):
 
 def _smoother_columns(steps):
     """What a run found out looking back, as far as it is there: older folders have none of it."""
-    found = {name: _columns_of(name, steps) for name in LOOKING_BACK}
+    found = {name: _columns_of(name, steps) for name in SMOOTHED}
     kinds = {"ancestral": Ancestral, "lineage": Lineage}
     if found["refined"]:
         from jaxslam.smoother.refine import Refined  # brings JAX, which nothing else here needs

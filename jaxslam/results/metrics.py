@@ -4,11 +4,17 @@ NumPy, float64, on the host. Poses are (x, y, heading) in the world's frame, met
 The start pose is given to the filter, so that unaligned errors mean something; both are reported.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
+from jaxslam.logs.log import Log
 from jaxslam.logs.truth import truth_at, wrap
+
+if TYPE_CHECKING:
+    from jaxslam.results.result import Result
 
 GATE = 0.5  # m, the widest gate within which a landmark may be called found
 
@@ -164,7 +170,7 @@ def map_error(mean, identity, truth, motion=None):
         if known
         else pair_by_distance(mean, landmarks, gate)
     )
-    found = dict(
+    found: dict = dict(
         matched=len(pairs), missed=len(landmarks) - len(pairs), spurious=len(mean) - len(pairs)
     )
     if len(pairs):
@@ -200,7 +206,7 @@ def association_accuracy(result, log=None, landmark_id=None):
     return float(right[counted].mean()) if counted.any() else np.nan
 
 
-def compute_errors(result, log=None):
+def compute_errors(result: "Result", log: Log | None = None) -> dict[str, float | int]:
     """The errors of a run for `summary.json`; a key is absent where it can't be computed.
 
     Empty without truth. `log` (default: the result's own) is where the truth comes from.

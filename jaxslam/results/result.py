@@ -1,7 +1,8 @@
-"""What a run found: the `Result`, and what is to be said about it."""
+"""The `Result` of a run, with warnings and advice about it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -20,8 +21,8 @@ FEWEST, UNLIKELY, WARPED = 3, 9.2, 0.1  # landmarks; chi-square of 2 (99 %); m
 
 
 class MapEstimate(NamedTuple):
-    """L landmarks: `id` [L], world `mean` [L, 2] m and `cov` [L, 3] (xx, xy, yy) m^2, times seen
-    `n` [L], and the log's `identity` [L] (-1 where identities were hidden)."""
+    """L landmarks in the world frame: `id` [L] (landmark id), `mean` [L, 2] m, `cov` [L, 3]
+    (xx, xy, yy) m^2, number of measurements `n` [L], and the log's `identity` [L] (-1: unknown)."""
 
     id: np.ndarray
     mean: np.ndarray
@@ -29,48 +30,53 @@ class MapEstimate(NamedTuple):
     n: np.ndarray
     identity: np.ndarray
 
+    def __repr__(self):
+        return f"MapEstimate({len(self.mean)} landmarks)"
 
-@dataclass(frozen=True)
+
+COLUMN = {"column": True}  # of a field of `Result` that is a column of `steps.npz`
+
+
+@dataclass(frozen=True, repr=False)
 class Result:
-    """A run's estimates, frame by frame, T frames.
+    """Estimates of a run over T frames.
 
-    `time` int64 [T] ns. `pose` [T, 3] (x, y, heading): filtered mean, m and rad, in the frame of
-    the log's start pose; `cov` [T, 3, 3]. `ess` [T]; `resampled` [T]; `new` [T]: landmarks begun by
-    the best particle; `overflow`, `forgotten`, `outliers` [T]: mean number per particle;
-    `log_evidence` [T]; `nonfinite`, `degenerate` [T]: flags of `filter.Info`. `landmark_id` [T, K]: what
-    the best particle took each measurement for (frame * K + k of the measurement that began the
-    landmark, or -1 new, -2 clutter, -3 padding), `row` [T, K]: the measurement's row in the log.
-    `landmarks`: the map at the end. `dead_reckoning` [T, 3]: odometry alone. `dropped`: rows left
-    out, by reason.
+    Filtered, by frame: `time` int64 [T] ns; `pose` [T, 3] (x, y, heading) and `cov` [T, 3, 3], mean
+    and covariance in m and rad, in the frame of the log's start pose; `ess` [T]; `resampled` [T];
+    `new` [T]: landmarks that the best particle began; `overflow`, `forgotten`, `outliers` [T]: mean
+    number per particle; `log_evidence` [T]; `nonfinite`, `degenerate` [T]: flags of `step.Info`;
+    `landmark_id` [T, K]: landmark that the best particle matched each measurement with
+    (frame * K + k of the measurement that began it; -1 new, -2 clutter, -3 padding); `row` [T, K]:
+    the measurement's row in the log; `dead_reckoning` [T, 3]: odometry alone. `landmarks`: the
+    map at the end. `dropped`: number of rows left out, by reason. `entropy` [T, K], nats:
+    disagreement of the particles about a match (`events.association_entropy`).
 
-    What looks back: `ancestral`: the posterior over the whole path, `lineage`: the past of the
-    particle that was best at the end (both None if the genealogy took too much memory), and
-    `refined`: that past and its map by least squares, in `refine_seconds` (None: not refined).
-    `entropy` [T, K], nats: how much particles differed about what each measurement is of
-    (`ambiguity`). `events` [E, 4]: what rejuvenation did to the map (`rejuvenation.Past`; None:
-    there was none).
+    Smoothed: `ancestral`: mean and covariance of the surviving particles' paths; `lineage`: path of
+    the particle that was best at the end (both None where the genealogy took too much memory);
+    `refined`: that path and its map by least squares, in `refine_seconds` (None: not refined).
+    `events` [E, 4]: what rejuvenation changed in the map (`rejuvenation.SharedPast`), or None.
     """
 
     log: Log
     config: Config
     params: Params
     seed: int
-    time: np.ndarray
-    pose: np.ndarray
-    cov: np.ndarray
-    ess: np.ndarray
-    resampled: np.ndarray
-    new: np.ndarray
-    overflow: np.ndarray
-    outliers: np.ndarray
-    forgotten: np.ndarray
-    log_evidence: np.ndarray
-    nonfinite: np.ndarray
-    degenerate: np.ndarray
-    landmark_id: np.ndarray
-    row: np.ndarray
+    time: np.ndarray = field(metadata=COLUMN)
+    pose: np.ndarray = field(metadata=COLUMN)
+    cov: np.ndarray = field(metadata=COLUMN)
+    ess: np.ndarray = field(metadata=COLUMN)
+    resampled: np.ndarray = field(metadata=COLUMN)
+    new: np.ndarray = field(metadata=COLUMN)
+    overflow: np.ndarray = field(metadata=COLUMN)
+    outliers: np.ndarray = field(metadata=COLUMN)
+    forgotten: np.ndarray = field(metadata=COLUMN)
+    log_evidence: np.ndarray = field(metadata=COLUMN)
+    nonfinite: np.ndarray = field(metadata=COLUMN)
+    degenerate: np.ndarray = field(metadata=COLUMN)
+    landmark_id: np.ndarray = field(metadata=COLUMN)
+    row: np.ndarray = field(metadata=COLUMN)
     landmarks: MapEstimate
-    dead_reckoning: np.ndarray
+    dead_reckoning: np.ndarray = field(metadata=COLUMN)
     seconds: float
     compile_seconds: float
     dropped: dict[str, int]
@@ -78,16 +84,47 @@ class Result:
     lineage: Lineage | None = None
     refined: "Refined | None" = None
     refine_seconds: float | None = None
-    events: np.ndarray | None = None
-    entropy: np.ndarray | None = None
+    events: np.ndarray | None = field(default=None, metadata=COLUMN)
+    entropy: np.ndarray | None = field(default=None, metadata=COLUMN)
+
+    def __repr__(self):
+        frames, marks = len(self.time), len(self.landmarks.mean)
+        return (
+            f"Result({self.log.name!r}, {self.config.sensor}, {frames} frames, {marks} landmarks)"
+        )
+
+    def trajectory_columns(self) -> dict[str, np.ndarray]:
+        """Return the trajectory as columns [T], for `pandas.DataFrame` for example.
+
+        Metres, radians, and seconds since the epoch or the start of the clock (`time_ns` is exact).
+        `smoothed_...` only if the run was refined.
+        """
+        parts = {"": (self.pose, self.cov)}
+        if self.refined is not None:
+            parts["smoothed_"] = (self.refined.pose, self.refined.cov)
+        columns = {"time_ns": self.time, "time_s": self.time / 1e9}
+        for prefix, (pose, cov) in parts.items():
+            for i, name in enumerate(("x_m", "y_m", "heading_rad")):
+                columns[prefix + name] = pose[:, i]
+                columns[f"{prefix}sd_{name}"] = np.sqrt(cov[:, i, i])
+        return columns | {"ess": self.ess, "log_evidence": self.log_evidence}
+
+    def landmark_columns(self, smoothed: bool = True) -> dict[str, np.ndarray]:
+        """Return the map as columns [L], in m and m^2: the refined one if there is one and
+        `smoothed`, else the filter's."""
+        marks = self.landmarks_refined if smoothed and self.refined is not None else self.landmarks
+        assert marks is not None
+        values = np.column_stack([np.reshape(marks.mean, (-1, 2)), np.reshape(marks.cov, (-1, 3))])
+        columns = dict(zip(("x_m", "y_m", "sxx", "sxy", "syy"), values.T, strict=True))
+        return {"id": marks.id, **columns, "n": marks.n, "identity": marks.identity}
 
     @property
-    def match(self):
+    def match(self) -> np.ndarray:
         """`landmark_id` by its name of version 0.1."""
         return self.landmark_id
 
     @property
-    def landmarks_refined(self):
+    def landmarks_refined(self) -> MapEstimate | None:
         """The refined map, or None."""
         found = self.refined
         if found is None:
@@ -95,12 +132,12 @@ class Result:
         return MapEstimate(found.id, found.mean, found.landmark_cov, found.n, found.identity)
 
     @property
-    def log_likelihood(self):
+    def log_likelihood(self) -> float:
         """Log evidence of the whole log, nats."""
         return float(np.sum(self.log_evidence, dtype=float))
 
     @cached_property
-    def flags(self):
+    def flags(self) -> list[str]:
         """One line for everything that was lost or went wrong; empty when nothing did."""
         lines = [f"{count} measurements left out: {why}" for why, count in self.dropped.items()]
         lines += [
@@ -126,7 +163,7 @@ class Result:
         return lines
 
     @cached_property
-    def advice(self):
+    def advice(self) -> list[str]:
         """One line for everything that is no fault but should be known."""
         return self._shared_past + self._failed + self._warped
 
@@ -175,7 +212,9 @@ class Result:
             "the path): the ancestral covariance says nothing about it"
         ]
 
-    def save(self, directory, overwrite=False, log_source=None):
+    def save(
+        self, directory: str | Path, overwrite: bool = False, log_source: str | None = None
+    ) -> None:
         """Write the run's folder (`report.save`); without a `log_source` the log is copied too."""
         from jaxslam.results import run_folder  # here: it brings matplotlib
 

@@ -11,6 +11,7 @@ are the filter's, as it knew them at the time and at the end; `trajectory_refine
 import json
 import os
 import shutil
+from dataclasses import fields
 from importlib.metadata import PackageNotFoundError, version
 from math import cos, isfinite, sin
 from numbers import Integral
@@ -26,10 +27,6 @@ from jaxslam.results.events import ambiguous_measurements, list_events
 from jaxslam.results.figures import FIGURES, draw_figures
 from jaxslam.results.metrics import compute_errors
 
-COLUMNS = (
-    *("time", "pose", "cov", "ess", "resampled", "new", "overflow", "outliers", "forgotten"),
-    *("log_evidence", "nonfinite", "degenerate", "landmark_id", "row", "dead_reckoning"),
-)
 # Columns of `steps.npz` that keep the name they have had since version 0.1.
 FILE_NAMES = {
     "landmark_id": "match",
@@ -40,8 +37,7 @@ NEEDED = ("run.toml", "summary.json", "steps.npz")  # without these it is no run
 FINISHED = "summary.json"
 CHECKPOINTS, PARTIAL = "checkpoints", ".results"
 WORKING = (run_lock.NAME, CHECKPOINTS, PARTIAL)  # what only an unfinished run's folder holds
-MAYBE = ("entropy", "events")  # columns that not every run has
-LOOKING_BACK = ("ancestral", "lineage", "refined")  # columns of what a run need not have
+SMOOTHED = ("ancestral", "lineage", "refined")  # tables of what a run may lack
 FILES = (
     *(*NEEDED, "trajectory.tum", "landmarks.csv", "events.jsonl", "log.npz", *FIGURES),
     *("trajectory_refined.tum", "landmarks_refined.csv"),
@@ -238,13 +234,12 @@ def _write_files(result, folder, source, figures=True):
     if source is None:
         save_log(folder / "log.npz", result.log)
         source = "log.npz"
-    columns = {name: np.asarray(getattr(result, name)) for name in COLUMNS}
-    tables = {"map": result.landmarks} | {name: getattr(result, name) for name in LOOKING_BACK}
+    columns: dict = {f.name: getattr(result, f.name) for f in fields(result) if f.metadata}
+    tables = {"map": result.landmarks} | {name: getattr(result, name) for name in SMOOTHED}
     for name, table in tables.items():
         if table is not None:
-            columns |= {f"{name}_{key}": np.asarray(v) for key, v in table._asdict().items()}
-    maybe = {name: getattr(result, name) for name in MAYBE}
-    columns |= {name: value for name, value in maybe.items() if value is not None}
+            columns |= {f"{name}_{key}": value for key, value in table._asdict().items()}
+    columns = {name: np.asarray(value) for name, value in columns.items() if value is not None}
     columns = {FILE_NAMES.get(name, name): column for name, column in columns.items()}
     np.savez_compressed(folder / "steps.npz", **columns)
     files = {

@@ -1,4 +1,4 @@
-"""What a run found, from where its filter ended: `Result`."""
+"""Assemble the `Result` of a run from the records of its steps."""
 
 import time
 from typing import NamedTuple
@@ -16,7 +16,10 @@ from jaxslam.smoother.rejuvenation import SharedPast
 
 
 class Summary(NamedTuple):
-    """What a run keeps of every step (`filter.Info` has the meanings)."""
+    """Record of a step of the best particle, and of sums over all (see `step.Info`).
+
+    `survivor`: the best particle's first descendant after resampling.
+    """
 
     pose: jax.Array
     cov: jax.Array
@@ -33,8 +36,18 @@ class Summary(NamedTuple):
     survivor: jax.Array
 
 
+# Fields that `Summary` and `Result` take from `step.Info` as they are; there, `pose` and
+# `landmark_id` are those of all particles. A new diagnostic is a field of each of the three.
+COPIED = tuple(
+    name
+    for name in Summary._fields
+    if name in fastslam.Info._fields and name not in ("pose", "landmark_id")
+)
+COUNTS = "overflow", "outliers", "forgotten"  # over all particles; in `Result` the mean
+
+
 class ParticleHistory(NamedTuple):
-    """What the genealogy needs of every step, of all particles (`filter.Info`)."""
+    """Record of a step of all particles, for the genealogy (see `step.Info`)."""
 
     pose: jax.Array
     landmark_id: jax.Array
@@ -42,26 +55,35 @@ class ParticleHistory(NamedTuple):
 
 
 class RunProgress(NamedTuple):
-    """How far the filter has come: its `state`, a `Summary` of every chunk (on the host), the
-    genealogy (None: too large, or of another process) since the `past` that all share (None:
-    none), frames `done`, and `seconds` that took; `entropy` of every chunk (`ambiguity`)."""
+    """Progress of a run: `state` after `done` frames, which took `seconds`.
+
+    Of every chunk, on the host: `summaries` (`Summary`) and `entropy` (`association_entropy`).
+    `tree`: genealogy since the `shared_past` (None: no rejuvenation yet); None if it became too
+    large, and on processes other than the leader.
+    """
 
     state: fastslam.State
     summaries: list
     tree: Tree | None
     done: int
     seconds: float
-    past: SharedPast | None
+    shared_past: SharedPast | None
     entropy: list
 
 
 def local_origin(log):
-    """A local origin [3], which keeps coordinates small: float32 has 7 digits."""
+    """Return the filter's origin [3], near the start: float32 has 7 digits."""
     return np.array([*log.start_pose[:2], 0.0])
 
 
-def assemble_result(at, log, config, params, seed, data, compile_seconds):
-    """The `Result` of a filter that is done (`Filtered`), not refined."""
+def assemble_result(so_far, log, config, params, seed, data, compile_seconds):
+    """Assemble the `Result`, not refined, from the `RunProgress` at the end of a log."""
+    begin, origin = time.perf_counter(), local_origin(log)
+    summary = Summary(*(np.concatenate(parts) for parts in zip(*so_far.summaries, strict=True)))
+    best, state = int(summary.survivor[-1]), settle_donated(so_far.state, config)
+    fields = _genealogy_fields(so_far, sharding.to_host(state.log_weight), best, origin)
+    fields |= {name: getattr(summary, name) for name in COPIED}
+    fields |= {name: fields[name] / config.particles for name in COUNTS}
     numbers = jax.tree.map(jnp.asarray, params)
     return Result(
         log=log,
@@ -69,70 +91,54 @@ def assemble_result(at, log, config, params, seed, data, compile_seconds):
         params=params,
         seed=seed,
         time=data.time,
-        row=data.row,
-        dead_reckoning=dead_reckoning(data.odometry, log.start_pose),
-        compile_seconds=compile_seconds,
-        dropped=data.dropped,
-        **_filter_fields(at, numbers, config, data.identities, local_origin(log)),
-    )
-
-
-def _filter_fields(at, params, config, identities, origin):
-    """The fields of `Result` that the filter found, in the world's frame."""
-    begin = time.perf_counter()
-    summary = Summary(*(np.concatenate(parts) for parts in zip(*at.summaries, strict=True)))
-    best, n = int(summary.survivor[-1]), config.particles
-    state = settle_donated(at.state, config)
-    found = _genealogy_fields(at, sharding.to_host(state.log_weight), best, origin)
-    return found | dict(
         pose=summary.pose + origin,
-        entropy=np.concatenate(at.entropy),
-        overflow=summary.overflow / n,
-        outliers=summary.outliers / n,
-        forgotten=summary.forgotten / n,
+        cov=summary.cov,
+        entropy=np.concatenate(so_far.entropy),
         landmark_id=summary.landmark_id.astype(np.int64),
-        landmarks=_map(state, best, params, config, identities, origin),
-        seconds=at.seconds + time.perf_counter() - begin,
-        **{name: getattr(summary, name) for name in (
-            "cov", "ess", "resampled", "new", "log_evidence", "nonfinite", "degenerate")},
-    )  # fmt: skip
-
-
-def _genealogy_fields(at, log_weight, best, origin):
-    """`Result.ancestral` and `Result.lineage`, in the world's frame, and the past's events."""
-    if at.tree is None:
-        return dict(events=None if at.past is None else at.past.event)
-    whole, past, before = (
-        smooth_ancestral(at.tree, log_weight),
-        trace_lineage(at.tree, best),
-        at.past,
+        row=data.row,
+        landmarks=_estimate_map(state, best, numbers, config, data.identities, origin),
+        dead_reckoning=dead_reckoning(data.odometry, log.start_pose),
+        dropped=data.dropped,
+        **fields,
+        compile_seconds=compile_seconds,
+        seconds=so_far.seconds + time.perf_counter() - begin,
     )
-    if before is not None:
-        # Every particle has drawn a path of its own there.
-        alone, cov = np.full(len(before.pose), len(log_weight)), before.cov
-        if len(cov) < len(alone):  # the last time failed: as if there were one ancestor
-            alone, cov = np.ones_like(alone), np.zeros((len(alone), 3, 3))
-        whole = _concatenate(Ancestral(before.pose, cov, alone), whole)
-        past = _concatenate(Lineage(before.pose, before.landmark_id), past)
+
+
+def _genealogy_fields(so_far, log_weight, best, origin):
+    """Return the `Result`'s `ancestral` and `lineage`, in the world frame, and `events`."""
+    shared = so_far.shared_past
+    events = None if shared is None else shared.event
+    if so_far.tree is None:
+        return dict(events=events)
+    ancestral = smooth_ancestral(so_far.tree, log_weight)
+    lineage = trace_lineage(so_far.tree, best)
+    if shared is not None:
+        # Each particle has drawn its own path there.
+        distinct, cov = np.full(len(shared.pose), len(log_weight)), shared.cov
+        if len(cov) < len(distinct):  # the last refinement failed: as if there were one ancestor
+            distinct, cov = np.ones_like(distinct), np.zeros((len(distinct), 3, 3))
+        ancestral = _concatenate(Ancestral(shared.pose, cov, distinct), ancestral)
+        lineage = _concatenate(Lineage(shared.pose, shared.landmark_id), lineage)
     return dict(
-        ancestral=whole._replace(pose=whole.pose + origin),
-        lineage=Lineage(past.pose + origin, past.landmark_id),
-        events=None if before is None else before.event,
+        ancestral=ancestral._replace(pose=ancestral.pose + origin),
+        lineage=Lineage(lineage.pose + origin, lineage.landmark_id),
+        events=events,
     )
 
 
 def _concatenate(before, after):
-    """Columns of one stretch of frames and of the next."""
+    """Concatenate the fields of two consecutive stretches of frames."""
     return type(after)(*map(np.concatenate, zip(before, after, strict=True)))
 
 
 def logged_identity(dense, identities):
-    """The log's identities of dense ones; -1 stays."""
+    """Look up the log's identities of dense ones; -1 stays."""
     return np.append(identities, -1)[np.asarray(dense, np.int64)]
 
 
-def _map(state, best, params, config, identities, origin):
-    """`MapEstimate`: the best particle's confirmed landmarks, averaged over all particles."""
+def _estimate_map(state, best, params, config, identities, origin):
+    """Average the best particle's confirmed landmarks over all particles (`MapEstimate`)."""
     table = map_estimate.summarise(state.landmarks, jnp.exp(state.log_weight), best, params, config)
     table = jax.tree.map(np.asarray, table)
     kept = np.flatnonzero(table.kept)

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.files import fsync_all, move_folder, temporary_sibling
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.filter.sharding import map_over_devices
 from jaxslam.parameter_file import validate
 from jaxslam.parameters import Params
@@ -29,7 +30,7 @@ from jaxslam.runs import run as runner
 from jaxslam.runs.assemble import RunProgress, assemble_result
 from jaxslam.smoother.genealogy import Tree
 
-BYTES = 2**29  # what the states of the runs in one program may take
+STATE_BYTES = 2**29  # what the states of the runs in one program may take
 TABLE = "runs.csv"
 COLUMNS = (
     *("log_likelihood", "min_ess", "n_landmarks", "overflow", "dead_reckoning_ate_m"),
@@ -53,11 +54,11 @@ SHOWN = {  # heading and format of the columns that people see
 
 
 class Task(NamedTuple):
-    """One of the runs: its seed, its `Params`, and what of these was `told` (name: value)."""
+    """One of the runs: its seed, its `Params`, and what of these was `swept` (name: value)."""
 
     seed: int
     params: Params
-    told: dict[str, float]
+    swept: dict[str, float]
 
 
 def plan_tasks(seeds, params, sweeps=()):
@@ -112,7 +113,7 @@ def run_tasks(log, config, todo, progress=None, refine=True, devices=1):
     if config.rejuvenate:
         return _run_in_turn(log, config, todo, progress, refine)
     size = memory.bytes_of(compiled.state_shapes(config))
-    most = min(len(todo), max(devices, BYTES // size))
+    most = min(len(todo), max(devices, STATE_BYTES // size))
     memory.check_memory(compiled.estimate_memory(config, len(log.frame_time)), config)
     results, steps, total = [], None, len(todo) * len(log.frame_time)
     for first in range(0, len(todo), most):
@@ -140,7 +141,7 @@ def _run_in_turn(log, config, todo, progress, refine):
 
 def _run_together(log, config, group, count, shared_by, steps, refine):
     """The compiled steps (None: compile them), and results of the first `count` tasks."""
-    data = [runner.frames_of(log, config, task.params) for task in group]
+    data = [frames_from_log(log, config, task.params) for task in group]
     params = [jax.tree.map(jnp.asarray, task.params) for task in group]
     keys = [jax.random.key(task.seed) for task in group]
     states = [runner.initial_state(log, config, key) for key in keys]
@@ -195,12 +196,12 @@ def summary_rows(todo, results):
     told = [run_folder.summarise(result) for result in results]
     there = [name for name in COLUMNS if any(name in summary for summary in told)]
     return [
-        {"seed": task.seed} | task.told | {name: summary.get(name) for name in there}
+        {"seed": task.seed} | task.swept | {name: summary.get(name) for name in there}
         for task, summary in zip(todo, told, strict=True)
     ]
 
 
-def table(found):
+def format_runs(found):
     """The runs as text; below each set of parameters mean and standard deviation over the seeds."""
     swept = [name for name in found[0] if name != "seed" and name not in COLUMNS]
     shown = [name for name in SHOWN if name in found[0]]
@@ -261,7 +262,7 @@ def save(todo, results, folder, overwrite=False, log_source=None):
     try:
         for task, result in zip(todo, results, strict=True):
             name = "-".join(
-                [f"seed-{task.seed}", *(f"{k}-{_short(v)}" for k, v in task.told.items())]
+                [f"seed-{task.seed}", *(f"{k}-{_short(v)}" for k, v in task.swept.items())]
             )
             run_folder.save(result, partly / name, log_source=log_source, figures=False)
         found = summary_rows(todo, results)

@@ -86,7 +86,7 @@ class Checkpoints:
 
     def __init__(self, folder, every=60.0, resume=False, overwrite=False, say=None):
         self.folder, self.every, self.resume = Path(folder), every, resume
-        self.overwrite, self.say = overwrite, say or _stderr
+        self.overwrite, self.say = overwrite, say or _print_to_stderr
         self.finished, self.stopped, self._kept, self._lock = False, False, [], None
 
     def __enter__(self):
@@ -115,7 +115,7 @@ class Checkpoints:
         if kind is KeyboardInterrupt and not error.args and self._files():
             raise KeyboardInterrupt(AGAIN) from None
 
-    def begin(self, log, config, params, seed):
+    def check_fingerprint(self, log, config, params, seed):
         """Raise `ValueError` if what there is to go on with is of another run."""
         self._run = {
             **run_fingerprint(log, config, params, seed),
@@ -155,7 +155,7 @@ class Checkpoints:
         sharding.broadcast_int(0)
         return None
 
-    def claim(self):
+    def take_over_folder(self):
         """From here on the folder is this run's: what others left in it is removed."""
         run_folder.clear_results(self.folder)
         if not self.resume:
@@ -165,7 +165,7 @@ class Checkpoints:
         self._last = time.monotonic()
 
     @contextmanager
-    def watching(self):
+    def catch_signals(self):
         """Within this, the first Ctrl-C (or SIGTERM) only asks to stop; the second ends at once.
 
         By a thread, since Python itself sees no signal while the compiled code runs.
@@ -201,7 +201,7 @@ class Checkpoints:
                 end_now("interrupted", 130)
             self.stopped = True
 
-    def reached(self, at, total, line):
+    def save_if_due(self, at, total, line):
         """Called after every chunk with `Filtered`: a checkpoint if it is time for one.
 
         `line`: how it goes. Raises `KeyboardInterrupt` if it was asked to stop.
@@ -213,7 +213,7 @@ class Checkpoints:
         path = _path(self._place, at.done)
         about = {"run": self._run, "versions": run_folder.versions(), "done": at.done}
         about |= {"seconds": at.seconds, "genealogy": at.tree is not None}
-        about |= {"past": at.past is not None}
+        about |= {"past": at.shared_past is not None}
         checkpoint_file.write_checkpoint(path, about, _columns(at))
         self._kept.append(path)
         self._prune()
@@ -253,7 +253,7 @@ class FollowerCheckpoints:
     def __init__(self, folder, wait):
         self._place, self._wait = Path(folder) / run_folder.CHECKPOINTS, wait
 
-    def begin(self, *_):
+    def check_fingerprint(self, *_):
         """Process 0 has looked."""
 
     def restore(self, shapes):
@@ -267,11 +267,11 @@ class FollowerCheckpoints:
         except ValueError as error:
             raise ValueError(f"{path}: every process of a run has to read it: {error}") from None
 
-    def claim(self):
+    def take_over_folder(self):
         """Process 0 has it."""
 
     @contextmanager
-    def watching(self):
+    def catch_signals(self):
         """Within this, signals are left to process 0, which gets them, too."""
         signals = signal.SIGINT, signal.SIGTERM
         before = [signal.signal(which, signal.SIG_IGN) for which in signals]
@@ -281,7 +281,7 @@ class FollowerCheckpoints:
             for which, handler in zip(signals, before, strict=True):
                 signal.signal(which, handler)
 
-    def reached(self, at, total, line):
+    def save_if_due(self, at, total, line):
         """Give process 0 what it puts aside."""
         wanted = sharding.broadcast_int(0)
         if wanted:
@@ -335,7 +335,7 @@ def _current_entries(get, stored):
 
     def get_by_either(name):
         former = name.replace("summary.landmark_id", "summary.match")
-        former = former.replace("landmark_id", "birth")
+        former = former.replace("landmark_id", "birth").replace(".appearances", ".looks")
         return get(name if name in stored else former)
 
     return get_by_either
@@ -363,8 +363,8 @@ def _columns(at):
     yield "entropy", at.entropy
     for name in at.summaries[0]._fields:
         yield f"summary.{name}", [getattr(part, name) for part in at.summaries]
-    if at.past is not None:
-        for name, column in at.past._asdict().items():
+    if at.shared_past is not None:
+        for name, column in at.shared_past._asdict().items():
             yield f"past.{name}", [column]
     if at.tree is not None:
         yield "tree.nodes", [np.array([len(level) for level in at.tree.pose])]
@@ -409,5 +409,5 @@ def _tree(get):
     return tree
 
 
-def _stderr(line):
+def _print_to_stderr(line):
     print(line, file=sys.stderr, flush=True)

@@ -18,11 +18,11 @@ from typing import NamedTuple
 
 from jaxslam.config import Config
 
-LIMIT = 60.0  # seconds in which all must have come
-GRACE = 3.0  # seconds in which a process may find by itself why another one ended
+RENDEZVOUS_TIMEOUT = 60.0  # seconds in which all must have come
+EXIT_TIMEOUT = 3.0  # seconds in which a process may find by itself why another one ended
 LOST = 69  # exit code: a process is missing, or was lost
-PATIENCE = 5.0  # seconds for what takes no time
-LONGEST = 2**16  # bytes of a line
+REPLY_TIMEOUT = 5.0  # seconds for what takes no time
+MAX_LINE = 2**16  # bytes of a line
 
 
 class ClusterAddress(NamedTuple):
@@ -89,7 +89,7 @@ def _from_launcher(env):
 _ORTE = "OMPI_MCA_orte_hnp_uri"
 
 
-def rendezvous(place, run, limit=LIMIT):
+def rendezvous(place, run, limit=RENDEZVOUS_TIMEOUT):
     """Connections to the other processes (of process 0), or to process 0, by process; when all are
     there and were told the same `run`, a dict for JSON.
 
@@ -130,7 +130,7 @@ def _gather(place, run, limit):
 
 def _greet(link, place, run, found):
     """Take in whoever has called; gives what is wrong about it, or None."""
-    link.settimeout(PATIENCE)
+    link.settimeout(REPLY_TIMEOUT)
     try:
         told = json.loads(_line(link))
         process, count, other = told["process"], told["processes"], told["run"]
@@ -171,7 +171,7 @@ def _call(place, run, limit):
                 ) from None
         time.sleep(0.2)
     _send(link, json.dumps({"process": place.process, "processes": place.processes, "run": run}))
-    link.settimeout(limit + PATIENCE)
+    link.settimeout(limit + REPLY_TIMEOUT)
     try:
         word, _, why = _line(link).partition(" ")
     except OSError:
@@ -220,7 +220,7 @@ def connect(place):
         ) from None
 
 
-class Team:
+class ProcessGroup:
     """The processes of a run that have met. Process 0 leads: it alone writes and speaks.
 
     Threads listen to the others: if one dies, this process says so and ends at once (exit 69), as
@@ -228,7 +228,7 @@ class Team:
     """
 
     def __init__(self, place, links):
-        self.leads, self._links = place.process == 0, links
+        self.is_leader, self._links = place.process == 0, links
         self._ending, self._idle, self._once = (
             threading.Event(),
             threading.Event(),
@@ -253,36 +253,36 @@ class Team:
         if word != "left":
             lost = rest if word == "lost" else who
             self._tell(f"lost {lost}")
-            time.sleep(0.5 if self.leads else 0)  # JAX aborts the others when this has gone
+            time.sleep(0.5 if self.is_leader else 0)  # JAX aborts the others when this has gone
             end_now(f"process {lost} died, or the connection to it broke", LOST)
         code = int(rest)
-        if not self.leads and (code < 2 or self._idle.wait(GRACE)):
+        if not self.is_leader and (code < 2 or self._idle.wait(EXIT_TIMEOUT)):
             os._exit(code)
-        if self.leads:
-            time.sleep(GRACE)
+        if self.is_leader:
+            time.sleep(EXIT_TIMEOUT)
             code = max(code, 2)  # 1 is that of a run with warnings
             self._tell(f"left {code}")
-            time.sleep(GRACE)
+            time.sleep(EXIT_TIMEOUT)
         end_now(f"process {who} ended with exit code {code}", code)
 
     def _tell(self, line):
-        for link in self._links.values() if self.leads else ():
+        for link in self._links.values() if self.is_leader else ():
             _send(link, line)
 
-    def wait(self):
+    def wait_for_leader(self):
         """Wait for process 0 to end, and end with it."""
         self._idle.set()
         threading.Event().wait()
 
-    def leave(self, code):
+    def exit(self, code):
         """End with this exit code; the others do the same."""
         sys.stdout.flush()
         self._ending.set()
         for link in self._links.values():
             _send(link, f"left {code}")
         # Process 0 goes last: JAX aborts the others when it has gone.
-        end = time.monotonic() + PATIENCE
-        for thread in self._threads if self.leads else ():
+        end = time.monotonic() + REPLY_TIMEOUT
+        for thread in self._threads if self.is_leader else ():
             thread.join(max(0, end - time.monotonic()))
         os._exit(code)  # JAX's own leave-taking would wait
 
@@ -295,7 +295,7 @@ def end_now(line, code):
 
 
 @contextmanager
-def silence_stderr():
+def silence_stdout():
     """Within this nothing gets to stdout, where Gloo says whom it reached."""
     sys.stdout.flush()
     kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
@@ -311,7 +311,7 @@ def silence_stderr():
 def _line(link):
     """The next line that comes, without its end; empty where the other end has closed."""
     parts = b""
-    while len(parts) < LONGEST:
+    while len(parts) < MAX_LINE:
         part = link.recv(1)  # what follows the line is left for later
         if part in (b"", b"\n"):
             return parts.decode(errors="replace") if part else ""

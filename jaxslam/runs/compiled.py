@@ -1,4 +1,4 @@
-"""The compiled loop over a chunk of frames, and what it needs."""
+"""Compile the loop over a chunk of frames, and estimate its memory."""
 
 from functools import lru_cache
 
@@ -8,93 +8,95 @@ import numpy as np
 
 from jaxslam.filter import sharding
 from jaxslam.filter import step as fastslam
-from jaxslam.runs import memory as capacity
-from jaxslam.runs.assemble import ParticleHistory, Summary
+from jaxslam.runs import memory
+from jaxslam.runs.assemble import COPIED, ParticleHistory, Summary
 
-CHUNK = 256  # frames per compiled loop, at most: one compilation serves logs of every length
-CHUNK_BYTES = 2**28  # what a chunk may hand over, at most
-TREE_BYTES = 2**31  # what the genealogy may take; beyond that it is given up
+CHUNK = 256  # frames of a chunk, at most: one compilation serves logs of every length
+CHUNK_BYTES = 2**28  # of what a chunk hands over, at most
+TREE_BYTES = 2**31  # of the genealogy; a larger one is given up
 
 
 def state_shapes(config):
-    """Shapes, types and places of the `State`, none of it made."""
+    """Return shapes, types and shardings of the `State` without making it."""
     state = jax.eval_shape(lambda key: fastslam.init(config, key), jax.random.key(0))
     state = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), state)
     if config.devices == 1:
         return state
     return jax.tree.map(
-        lambda leaf, place: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place),
+        lambda leaf, spec: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=spec),
         state,
         sharding.shardings(fastslam.layout(state), config),
     )
 
 
 def compile_loop(config, chunk, params):
-    """The compiled loop over a chunk of frames; the state need not be there yet."""
-    shapes_of = jax.tree.map(
+    """Compile `filter_frames` for a chunk (odometry, measurements) without making the state."""
+    shapes = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct(np.shape(leaf), jnp.result_type(leaf)), (*chunk, params)
     )
-    leaves, kind = jax.tree.flatten(shapes_of)
-    return _compile(config, tuple(leaves), kind)
+    leaves, structure = jax.tree.flatten(shapes)
+    return _compile(config, tuple(leaves), structure)
 
 
 @lru_cache(maxsize=2)
-def _compile(config, leaves, kind):
-    given = state_shapes(config), jnp.int32(0), *jax.tree.unflatten(kind, leaves)
-    # The state is given up (donated): no second copy of the map.
-    steps = jax.jit(
+def _compile(config, leaves, structure):
+    shapes = state_shapes(config), jnp.int32(0), *jax.tree.unflatten(structure, leaves)
+    filter_chunk = jax.jit(
         filter_frames,
         static_argnames="config",
-        donate_argnames="state",
+        donate_argnames="state",  # no second copy of the map
         out_shardings=_output_shardings(config),
     )
-    return steps.lower(jax.random.key(0), *given, config).compile()
+    return filter_chunk.lower(jax.random.key(0), *shapes, config).compile()
 
 
 def _output_shardings(config):
-    """Where what `filter_frames` gives belongs: its state is to fit the next chunk's."""
+    """Return the shardings of what `filter_frames` returns; the state's are those of its input."""
     if config.devices == 1:
         return None
-    lanes = jax.sharding.PartitionSpec(None, None, sharding.AXIS)
-    past = ParticleHistory(pose=lanes, landmark_id=lanes, ancestors=sharding.ALL)
-    places = Summary(*[sharding.ALL] * len(Summary._fields)), past
-    return jax.tree.map(lambda leaf: leaf.sharding, state_shapes(config)), sharding.shardings(
-        places, config
-    )
+    sharded = jax.sharding.PartitionSpec(None, None, sharding.AXIS)
+    history = ParticleHistory(pose=sharded, landmark_id=sharded, ancestors=sharding.ALL)
+    kept = Summary(*[sharding.ALL] * len(Summary._fields)), history
+    state = jax.tree.map(lambda leaf: leaf.sharding, state_shapes(config))
+    return state, sharding.shardings(kept, config)
+
+
+def node_bytes(config):
+    """Bytes of a node of the genealogy, or of one particle in a frame's `ParticleHistory`."""
+    return 4 * (config.measurements + 4)
 
 
 def estimate_memory(config, steps):
-    """`capacity.Memory` of a run of so many steps, as far as it is known before compiling."""
-    row = 4 * (config.measurements + 4)  # bytes of a node of the genealogy, or of `Leaves`
-    chunk = min(steps, chunk_size(config)) * row * config.particles
-    if config.rejuvenate:  # the draws, and what becomes of them
+    """Estimate the `Memory` of a run of so many steps, as far as it is known before compiling."""
+    frame = node_bytes(config) * config.particles
+    chunk = min(steps, chunk_size(config)) * frame
+    if config.rejuvenate:  # the draws, and what is computed from them
         chunk = max(chunk, 3 * 4 * (3 + 2 * config.landmarks) * config.particles)
-    tree = min(TREE_BYTES, steps * row * config.particles)
-    return capacity.Memory(capacity.bytes_of(state_shapes(config)), chunk, tree, 0)
+    tree = min(TREE_BYTES, steps * frame)
+    return memory.Memory(memory.bytes_of(state_shapes(config)), chunk, tree, 0)
 
 
 def _summarise(info):
-    # After resampling all weights are equal: the best particle lives on in its first child.
+    # After resampling all weights are equal: the best particle continues as its first descendant.
     survivor = jnp.argmax(info.ancestors == info.estimate.best)
     summary = Summary(
         pose=info.estimate.mean,
         cov=info.estimate.cov,
         landmark_id=info.landmark_id[:, info.estimate.best],
         survivor=survivor,
-        **{name: getattr(info, name) for name in Summary._fields if hasattr(info, name)
-           and name not in ("pose", "landmark_id")},
-    )  # fmt: skip
+        **{name: getattr(info, name) for name in COPIED},
+    )
     return summary, ParticleHistory(info.pose, info.landmark_id, info.ancestors)
 
 
 def filter_frames(key, state, count, odometry, measurements, params, config):
-    """The first `count` steps of a chunk of frames, and what is kept of each.
+    """Filter the first `count` frames of a chunk; return state, `Summary` and `ParticleHistory`.
 
-    No `lax.scan`: if the compiler knew the length, a loop of one step would be compiled otherwise,
-    and frames of nothing that fill up the last chunk would be filtered too. Both change last bits.
+    No `lax.scan`: with a length known to the compiler, a loop of one step would be compiled
+    differently, and the padding of the last chunk would be filtered too. Both change last bits.
     """
 
-    def one(state, i):
+    def filter_frame(state, i):
         frame = jax.tree.map(
             lambda leaf: jax.lax.dynamic_index_in_dim(leaf, i, keepdims=False),
             (odometry, measurements),
@@ -104,26 +106,27 @@ def filter_frames(key, state, count, odometry, measurements, params, config):
 
     def body(i, carry):
         state, kept = carry
-        state, found = one(state, i)
+        state, new = filter_frame(state, i)
         put = jax.lax.dynamic_update_index_in_dim
-        return state, jax.tree.map(lambda whole, part: put(whole, part, i, 0), kept, found)
+        return state, jax.tree.map(lambda column, entry: put(column, entry, i, 0), kept, new)
 
     kept = jax.tree.map(
         lambda leaf: jnp.zeros((len(odometry.dx), *leaf.shape), leaf.dtype),
-        jax.eval_shape(one, state, 0)[1],
+        jax.eval_shape(filter_frame, state, 0)[1],
     )
     return jax.lax.fori_loop(0, count, body, (state, kept))
 
 
 def chunk_size(config):
-    """Frames of a chunk; at least two, since an axis of length 1 would be compiled otherwise."""
-    frame = 4 * (config.measurements + 4) * config.particles  # bytes of a frame's `Leaves`
-    return max(2, min(CHUNK, CHUNK_BYTES // frame))
+    """Number of frames of a chunk; at least two: an axis of length 1 is compiled differently."""
+    return max(2, min(CHUNK, CHUNK_BYTES // (node_bytes(config) * config.particles)))
 
 
 def split_into_chunks(data, config, start=0, stops=()):
-    """The frames from `start` on in chunks of one length: how many, and what is short filled up.
-    None goes beyond one of the `stops`, numbers of frames done."""
+    """Yield the frames from `start` on as (number of frames, chunk), all padded to one length.
+
+    A chunk ends where the number of frames done is one of the `stops`.
+    """
     real = jnp.zeros(()).dtype
     size, begin = chunk_size(config), start
     while begin < len(data.time):

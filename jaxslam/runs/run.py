@@ -1,23 +1,25 @@
-"""A whole run: a `Log` in, a `Result` out."""
+"""Run the filter over a log: a `Log` in, a `Result` out."""
 
 import dataclasses
 import time
+from collections.abc import Callable
 from contextlib import nullcontext
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.config import Config
+from jaxslam.config import SENSORS, Config
 from jaxslam.filter import sharding
 from jaxslam.filter import step as fastslam
 from jaxslam.filter.frames import frames_from_log
-from jaxslam.logs.appearance_space import fit_appearance_space
+from jaxslam.logs.log import Log
 from jaxslam.parameter_file import validate
-from jaxslam.parameters import default_params
+from jaxslam.parameters import Params, default_params
 from jaxslam.results.events import association_entropy
-from jaxslam.runs import compiled
-from jaxslam.runs import memory as capacity
+from jaxslam.results.result import Result
+from jaxslam.runs import compiled, memory
 from jaxslam.runs.assemble import (
     RunProgress,
     assemble_result,
@@ -25,196 +27,209 @@ from jaxslam.runs.assemble import (
     logged_identity,
     settle_donated,
 )
-from jaxslam.runs.compiled import (
-    compile_loop,
-    estimate_memory,
-    split_into_chunks,
-    state_shapes,
-)
 from jaxslam.smoother.genealogy import Tree, trace_lineage
 from jaxslam.smoother.rejuvenation import Rejuvenator
 
+if TYPE_CHECKING:
+    from jaxslam.runs.checkpoints import Checkpoints, FollowerCheckpoints
 
-def config_for(log, sensor=None, association="maximum_likelihood", **settings):
-    """A `Config` whose sensor and sizes fit the log; `settings` are further `Config` fields.
 
-    Hidden bearings get the informed proposal unless told otherwise, and looks help to associate
-    them as far as the log's descriptors tell landmarks apart.
+def config_for(
+    log: Log, sensor: str | None = None, association: str = "maximum_likelihood", **settings: Any
+) -> Config:
+    """Return a `Config` whose sensor and sizes fit the log; `settings`: further `Config` fields.
+
+    Bearings with unknown association get the informed proposal, unless `settings` name another, and
+    as many descriptors as tell the log's landmarks apart.
     """
     if sensor is None:
-        sensor = next(s for s in ("range_bearing", "position", "bearing") if log.has(s))
+        sensor = next(s for s in SENSORS if log.has(s))
     settings.setdefault("measurements", max(1, int(np.bincount(log.frame, minlength=1).max())))
     if association == "known" and log.identity is not None:
         settings.setdefault("landmarks", max(1, len(np.unique(log.identity[log.identity >= 0]))))
     if sensor == "bearing" and association == "maximum_likelihood":
         settings.setdefault("proposal", "informed")
     if sensor == "bearing" and association != "known" and "descriptors" not in settings:
-        settings["descriptors"] = len(fit_appearance_space(log).within)
+        settings["descriptors"] = len(log.appearance_space.within)
     return Config(sensor=sensor, association=association, **settings)
 
 
-def run(log, config=None, params=None, seed=0, progress=None, refine=True, checkpoints=None):
-    """Filter a whole log, and refine what it found.
+def run(
+    log: Log,
+    config: Config | None = None,
+    params: Params | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int, str], None] | None = None,
+    refine: bool = True,
+    checkpoints: "Checkpoints | FollowerCheckpoints | None" = None,
+) -> Result:
+    """Filter a log and refine the best particle's path and map.
 
-    `config`: None for `config_for(log)`; `params`: None for `default_params`; `progress`: called
-    with (frames done, frames in all, a line about how it goes) now and then, first with (0, T, "")
-    before compiling. `refine`: improve the best particle's path and map by least squares
-    (`refined`). `checkpoints`: an `offline.Checkpoints` that has been entered, to go on from and to
-    write to. Raises `ValueError` when the log can't supply what the configuration asks, or memory
-    does not suffice.
+    `config`: None for `config_for(log)`. `params`: None for `default_params`. `progress`: called
+    after every chunk with (frames done, number of frames, a line of text), first with (0, T, "")
+    before compiling. `refine`: improve path and map by least squares (`Result.refined`).
+    `checkpoints`: `checkpoints.Checkpoints` that have been entered, to resume from and to write to.
+    Raises `ValueError` if the log lacks what the configuration needs, or memory does not suffice.
     """
     config = config_for(log) if config is None else config
     params = default_params(config.sensor, log) if params is None else params
     params = validate(params, "params")
-    data = frames_of(log, config, params)
+    data = frames_from_log(log, config, params)
     if progress:
         progress(0, len(data.time), "")
-    numbers = jax.tree.map(jnp.asarray, params)
-    capacity.check_memory(
-        estimate_memory(config, len(data.time)), config
-    )  # before compiling, which takes long
-    if checkpoints:
-        checkpoints.begin(log, config, params, seed)
+    # Before compiling, which takes long.
+    memory.check_memory(compiled.estimate_memory(config, len(data.time)), config)
 
-    total, key = len(data.time), jax.random.key(seed)
-    at, steps, compile_seconds = (
-        checkpoints and checkpoints.restore(state_shapes(config)),
-        None,
-        0.0,
-    )
-    if not at or at.done < total:
-        begin = time.perf_counter()
-        steps = compile_loop(config, next(iter(split_into_chunks(data, config)))[1], numbers)
-        compile_seconds = time.perf_counter() - begin
-        capacity.trim_heap()
-        need = capacity.memory_of_compiled(steps, estimate_memory(config, total), config)
-        if sharding.is_leader() and (checkpoints or need.total > 1e9):
-            capacity.print_memory(need)
-        if not at:
-            capacity.check_memory(need, config)
+    so_far = None
     if checkpoints:
-        checkpoints.claim()
-    if not at:
-        state = initial_state(log, config, key)
-        at = RunProgress(state, [], Tree() if sharding.is_leader() else None, 0, 0.0, None, [])
-    renewal = Rejuvenator(data, log, local_origin(log), params, config)
-    at = _filter(steps, key, at, data, numbers, config, renewal, progress, checkpoints)
-    result = assemble_result(at, log, config, params, seed, data, compile_seconds)
+        checkpoints.check_fingerprint(log, config, params, seed)
+        so_far = checkpoints.restore(compiled.state_shapes(config))
+    filter_chunk, compile_seconds = None, 0.0
+    if so_far is None or so_far.done < len(data.time):
+        begin = time.perf_counter()
+        filter_chunk = _compile(data, config, params)
+        compile_seconds = time.perf_counter() - begin
+        _check_compiled(filter_chunk, len(data.time), config, so_far, checkpoints)
+    if checkpoints:
+        checkpoints.take_over_folder()
+
+    key = jax.random.key(seed)
+    if so_far is None:
+        tree = Tree() if sharding.is_leader() else None
+        so_far = RunProgress(initial_state(log, config, key), [], tree, 0, 0.0, None, [])
+    rejuvenator = Rejuvenator(data, log, local_origin(log), params, config)
+    so_far = _filter(
+        filter_chunk, key, so_far, data, params, config, rejuvenator, progress, checkpoints
+    )
+    result = assemble_result(so_far, log, config, params, seed, data, compile_seconds)
     return refine_result(result) if refine else result
 
 
+def _compile(data, config, params):
+    """Compile the loop over a chunk of the frames."""
+    _, chunk = next(iter(compiled.split_into_chunks(data, config)))
+    filter_chunk = compiled.compile_loop(config, chunk, jax.tree.map(jnp.asarray, params))
+    memory.trim_heap()
+    return filter_chunk
+
+
+def _check_compiled(filter_chunk, frames, config, so_far, checkpoints):
+    """Print the memory that a large run needs; raise `ValueError` if a new run does not fit."""
+    need = memory.memory_of_compiled(filter_chunk, compiled.estimate_memory(config, frames), config)
+    if sharding.is_leader() and (checkpoints or need.total > 1e9):
+        memory.print_memory(need)
+    if so_far is None:
+        memory.check_memory(need, config)
+
+
 def initial_state(log, config, key):
-    """The `State` before a log's first frame."""
+    """Make the `State` before a log's first frame."""
     return fastslam.init(config, key, log.start_pose - local_origin(log), log.start_cov)
 
 
 def refine_result(result, progress=None):
-    """The result with its best particle's lineage refined (`refine.refine`); as it is if it has no
-    finite lineage, or (with `refine_seconds`, and a flag) if that takes too much memory or has no
-    solution. `progress`: called with (iterations done, None)."""
+    """Refine the best particle's lineage and return the result with it.
+
+    Returned as it is without a finite lineage, and with `refine_seconds` only (which raises a flag)
+    if refinement takes too much memory or has no solution. `progress`: called with (iterations
+    done, None).
+    """
     from jaxslam.smoother.refine import refine  # here: the filter alone does without it
 
-    past, log, config = result.lineage, result.log, result.config
-    if past is None or not np.isfinite(past.pose).all():
+    lineage, log, config = result.lineage, result.log, result.config
+    if lineage is None or not np.isfinite(lineage.pose).all():
         return result
     begin = time.perf_counter()
-    data = frames_of(log, dataclasses.replace(config, descriptors=0), result.params)
+    data = frames_from_log(log, dataclasses.replace(config, descriptors=0), result.params)
     try:
-        found = refine(
-            data, past.pose, past.landmark_id, log.start_pose, log.start_cov, result.params,
+        refined = refine(
+            data, lineage.pose, lineage.landmark_id, log.start_pose, log.start_cov, result.params,
             config.sensor, known=config.association == "known",
             progress=progress and (lambda done, _: progress(done, None)),
         )  # fmt: skip
-    except (MemoryError, np.linalg.LinAlgError):  # what was filtered is not lost with it
-        return dataclasses.replace(result, refine_seconds=time.perf_counter() - begin)
-    found = found._replace(identity=logged_identity(found.identity, data.identities))
-    return dataclasses.replace(result, refined=found, refine_seconds=time.perf_counter() - begin)
+        refined = refined._replace(identity=logged_identity(refined.identity, data.identities))
+    except (MemoryError, np.linalg.LinAlgError):  # keep what was filtered
+        refined = result.refined
+    return dataclasses.replace(result, refined=refined, refine_seconds=time.perf_counter() - begin)
 
 
-def frames_of(log, config, params):
-    """`Frames` of a log, as a configuration asks for them."""
-    known = config.association == "known"
-    sizes = config.measurements, params, known, config.descriptors
-    return frames_from_log(log, config.sensor, *sizes)
-
-
-def _filter(steps, key, at, data, params, config, renewal, progress, checkpoints):
-    """`Filtered` at the end: from where it is `at`, the compiled `steps` over all chunks."""
-    total, start, begin = len(data.time), at.done, time.perf_counter() - at.seconds
-    session = time.perf_counter()
-    with checkpoints.watching() if checkpoints else nullcontext():
-        for count, chunk in split_into_chunks(data, config, at.done, renewal.due):
-            if at.done in renewal.due:
-                at = _rejuvenate(renewal, key, at, config)
-            state = _run_chunk(steps, (key, at.state, jnp.int32(count), *chunk, params), at, count)
-            spent = time.perf_counter() - begin
-            tree = at.tree
-            if (
-                tree is not None
-                and tree.nodes * 4 * (config.measurements + 4) > compiled.TREE_BYTES
-            ):
-                tree = None
-            at = at._replace(state=state, tree=tree, done=at.done + count, seconds=spent)
-            speed = (at.done - start) / (time.perf_counter() - session)
-            # All processes work this out, or none; it is one of them that says it.
-            line = (
-                _progress_line(at, speed)
-                if progress or checkpoints or jax.process_count() > 1
-                else ""
+def _filter(filter_chunk, key, so_far, data, params, config, rejuvenator, progress, checkpoints):
+    """Filter the frames after `so_far` chunk by chunk; return the `RunProgress` at the end."""
+    total, params = len(data.time), jax.tree.map(jnp.asarray, params)
+    start, before, begin = so_far.done, so_far.seconds, time.perf_counter()
+    with checkpoints.catch_signals() if checkpoints else nullcontext():
+        for count, chunk in compiled.split_into_chunks(data, config, start, rejuvenator.due):
+            if so_far.done in rejuvenator.due:
+                so_far = _rejuvenate(rejuvenator, key, so_far, config)
+            state = _run_chunk(
+                filter_chunk, (key, so_far.state, jnp.int32(count), *chunk, params), so_far, count
             )
+            elapsed, tree = time.perf_counter() - begin, so_far.tree
+            if tree is not None and tree.nodes * compiled.node_bytes(config) > compiled.TREE_BYTES:
+                tree = None
+            so_far = so_far._replace(
+                state=state, tree=tree, done=so_far.done + count, seconds=before + elapsed
+            )
+            line = ""
+            # The state is on all processes, so each of them computes the line, or none.
+            if progress or checkpoints or jax.process_count() > 1:
+                line = _progress_line(so_far, (so_far.done - start) / elapsed)
             if progress:
-                progress(at.done, total, line)
+                progress(so_far.done, total, line)
             if checkpoints:
-                checkpoints.reached(at, total, line)
-    return at
+                checkpoints.save_if_due(so_far, total, line)
+    return so_far
 
 
-def _rejuvenate(renewal, key, at, config):
-    """Where the filter is with its past refined and its particles drawn anew; as it is if the
-    genealogy was given up."""
-    if not sharding.broadcast_int(int(at.tree is not None)):
-        return at
-    best = int(at.summaries[-1].survivor[-1])
-    since = trace_lineage(at.tree, best) if at.tree is not None else None
-    state = settle_donated(at.state, config)
-    state, past, lost = renewal.rejuvenated(key, state, at.past, since, at.done, best)
+def _rejuvenate(rejuvenator, key, so_far, config):
+    """Refine the best particle's lineage and redraw all particles; no change if the genealogy was
+    given up."""
+    if not sharding.broadcast_int(int(so_far.tree is not None)):
+        return so_far
+    last = so_far.summaries[-1]
+    best = int(last.survivor[-1])
+    lineage = trace_lineage(so_far.tree, best) if so_far.tree is not None else None
+    state, shared_past, lost = rejuvenator.rejuvenate(
+        key, settle_donated(so_far.state, config), so_far.shared_past, lineage, so_far.done, best
+    )
+    so_far = so_far._replace(state=state, shared_past=shared_past)
     if lost is None:
-        return at._replace(state=state, past=past)
-    last = at.summaries[-1]
+        return so_far
     overflow = np.array(last.overflow)
     overflow[-1] += lost * config.particles
-    summaries = [*at.summaries[:-1], last._replace(overflow=overflow)]
-    return at._replace(
-        state=state, summaries=summaries, tree=Tree() if sharding.is_leader() else None, past=past
+    return so_far._replace(
+        summaries=[*so_far.summaries[:-1], last._replace(overflow=overflow)],
+        tree=Tree() if sharding.is_leader() else None,
     )
 
 
-def _run_chunk(steps, given, at, count):
-    """One chunk's steps, added to what there is; gives the state after it."""
-    state, found = steps(*given)
-    # The last chunk is filled up.
-    summary, past = jax.tree.map(lambda leaf: sharding.to_host(leaf)[:count], found)
-    at.summaries.append(summary)
-    at.entropy.append(association_entropy(past.landmark_id, past.ancestors))
-    if at.tree is not None:
-        at.tree.extend(*past)
+def _run_chunk(filter_chunk, arguments, so_far, count):
+    """Filter a chunk, append its `count` steps to `so_far`, and return the state after it."""
+    state, kept = filter_chunk(*arguments)
+    # The last chunk is padded.
+    summary, history = jax.tree.map(lambda leaf: sharding.to_host(leaf)[:count], kept)
+    so_far.summaries.append(summary)
+    so_far.entropy.append(association_entropy(history.landmark_id, history.ancestors))
+    if so_far.tree is not None:
+        so_far.tree.extend(*history)
     return state
 
 
-def _progress_line(at, speed):
-    """One line on how it goes: speed, effective sample size, the best particle's landmarks."""
-    last = at.summaries[-1]
-    held = int(_count_landmarks(at.state, last.survivor[-1]))
-    size = capacity.resident_bytes()
-    memory = "" if size is None else f", {size / 1e9:.1f} GB"
-    return f"{speed:.3g} steps/s, ESS {last.ess[-1]:.0f}, {held} landmarks{memory}"
+def _progress_line(so_far, speed):
+    """Format speed, effective sample size, number of the best particle's landmarks, and memory."""
+    last = so_far.summaries[-1]
+    landmarks = int(_count_landmarks(so_far.state, last.survivor[-1]))
+    size = memory.resident_bytes()
+    text = "" if size is None else f", {size / 1e9:.1f} GB"
+    return f"{speed:.3g} steps/s, ESS {last.ess[-1]:.0f}, {landmarks} landmarks{text}"
 
 
 @jax.jit
 def _count_landmarks(state, particle):
-    """How many landmarks one particle has."""
-    at, past = particle, state.ancestry
+    """Count the landmarks of one particle."""
+    ancestor, ancestry = particle, state.ancestry
     count = state.landmarks.count
-    if past is not None:  # each slot's are where the particle's ancestor was
-        at = jnp.where(past.chain < 0, particle, past.chains[past.chain, particle])
-    return jnp.sum(count[jnp.arange(len(count)), at] > 0)
+    if ancestry is not None:  # each slot is still where the particle's ancestor was
+        composed = ancestry.chains[ancestry.chain, particle]
+        ancestor = jnp.where(ancestry.chain < 0, particle, composed)
+    return jnp.sum(count[jnp.arange(len(count)), ancestor] > 0)

@@ -1,6 +1,5 @@
-"""Kinds of what rejuvenation did to the map."""
+"""Kinds of events of rejuvenation in `Result.events`."""
 
-# Kinds of what rejuvenation did (`Result.events`).
 KINDS = "merged", "dropped", "found", "failed"
 
 MERGED, DROPPED, FOUND, FAILED = range(len(KINDS))

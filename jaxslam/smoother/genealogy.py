@@ -1,8 +1,8 @@
 """The posterior over the whole path, from the particles' genealogy.
 
-Particles that are resampled away take their past with them: what is left is a tree, whose old
-levels shrink to one node. It is kept on the host and cut back as it grows (Jacob, Murray and
-Rubenthaler, "Path storage in the particle filter", Statistics and Computing 2015).
+The ancestors of the living particles form a tree whose older levels shrink to one node. It is kept
+on the host and pruned as it grows (Jacob, Murray and Rubenthaler, "Path storage in the particle
+filter", Statistics and Computing 2015).
 """
 
 from typing import NamedTuple
@@ -11,9 +11,9 @@ import numpy as np
 
 
 class Ancestral(NamedTuple):
-    """The smoothed path, T frames: mean `pose` [T, 3] (m, rad), `cov` [T, 3, 3], and how many
-    `distinct` [T] ancestors the particles of the end have there. One ancestor has no spread, which
-    does not mean that it is right."""
+    """The smoothed path, T frames: mean `pose` [T, 3] (m, rad), `cov` [T, 3, 3], and the number of
+    `distinct` [T] ancestors of the final particles. A single ancestor has no spread, which does not
+    mean that it is right."""
 
     pose: np.ndarray
     cov: np.ndarray
@@ -21,17 +21,17 @@ class Ancestral(NamedTuple):
 
 
 class Lineage(NamedTuple):
-    """One particle's whole past: `pose` [T, 3] and `landmark_id` [T, K], as `filter.Info.landmark_id`."""
+    """One particle's path: `pose` [T, 3] and `landmark_id` [T, K] (as in `step.Info`)."""
 
     pose: np.ndarray
     landmark_id: np.ndarray
 
 
 class Tree:
-    """Every pose that still has a living descendant, frame by frame.
+    """Every pose that still has a living descendant, one level per frame.
 
-    Level t has n_t nodes: `pose[t]` [n_t, 3] and `landmark_id[t]` [n_t, K]. `origin[t]` [n_(t+1)] are the
-    rows of level t that the nodes of the next descend from; the last one's, [N], are the particles.
+    Level t has n_t nodes: `pose[t]` [n_t, 3] and `landmark_id[t]` [n_t, K]. `origin[t]` [n_(t+1)]:
+    the parent, in level t, of every node of the next level; the last is that of the N particles.
     """
 
     def __init__(self):
@@ -42,13 +42,13 @@ class Tree:
         return sum(map(len, self.pose))
 
     def extend(self, pose, landmark_id, ancestors):
-        """Add C frames: `pose` [C, 3, N] and `landmark_id` [C, K, N] of all particles before resampling,
-        and `ancestors` [C, N]: which of them each particle after it continues."""
+        """Add C frames: `pose` [C, 3, N] and `landmark_id` [C, K, N] of all particles before
+        resampling, and the `ancestors` [C, N] of the particles after it."""
         first, levels = len(self.pose), []
         follow = ancestors[-1]
         for t in reversed(range(len(ancestors))):
-            alive, rows = _used(follow, ancestors.shape[1])
-            levels.append((pose[t].T[alive], landmark_id[t].T[alive], rows))
+            alive, origin = _compact(follow, ancestors.shape[1])
+            levels.append((pose[t].T[alive], landmark_id[t].T[alive], origin))
             follow = ancestors[t - 1][alive]
         if first:
             self.origin[-1] = self.origin[-1][alive]
@@ -58,9 +58,9 @@ class Tree:
         self._prune(first)
 
     def _prune(self, end):
-        """Forget the nodes before level `end` whose last descendant has died."""
+        """Remove the nodes before level `end` without living descendants."""
         for t in reversed(range(end)):
-            alive, self.origin[t] = _used(self.origin[t], len(self.pose[t]))
+            alive, self.origin[t] = _compact(self.origin[t], len(self.pose[t]))
             if len(alive) == len(self.pose[t]):  # then nothing older has lost a child either
                 break
             self.pose[t], self.landmark_id[t] = self.pose[t][alive], self.landmark_id[t][alive]
@@ -68,16 +68,16 @@ class Tree:
                 self.origin[t - 1] = self.origin[t - 1][alive]
 
 
-def _used(rows, n):
-    """The rows of n that occur in `rows`, in order, and where each of `rows` is among them."""
+def _compact(index, n):
+    """The numbers below n that occur in `index`, in order, and `index` counted among them."""
     used = np.zeros(n, bool)
-    used[rows] = True
-    place = np.cumsum(used, dtype=np.int32) - 1
-    return np.flatnonzero(used), place[rows]
+    used[index] = True
+    position = np.cumsum(used, dtype=np.int32) - 1
+    return np.flatnonzero(used), position[index]
 
 
 def smooth_ancestral(tree, log_weight):
-    """`Ancestral`: the weighted mean and covariance of whole paths, by the final `log_weight` [N].
+    """Compute `Ancestral`: weighted mean and covariance of paths, by the final `log_weight` [N].
 
     The heading's mean is circular. Particles without weight do not count as descendants.
     """
@@ -88,9 +88,9 @@ def smooth_ancestral(tree, log_weight):
     mean, cov, distinct = np.empty((total, 3)), np.empty((total, 3, 3)), np.empty(total, np.int64)
     for t in reversed(range(total)):
         weight = np.bincount(tree.origin[t], weight, len(tree.pose[t]))
-        have = weight > 0
-        mean[t], cov[t] = _moments(tree.pose[t][have].astype(float), weight[have])
-        distinct[t] = have.sum()
+        alive = weight > 0
+        mean[t], cov[t] = _moments(tree.pose[t][alive].astype(float), weight[alive])
+        distinct[t] = alive.sum()
     return Ancestral(mean, cov, distinct)
 
 
@@ -105,13 +105,13 @@ def _moments(pose, weight):
 
 
 def trace_lineage(tree, particle):
-    """`Lineage` of one of the living particles."""
-    row, rows = particle, []
+    """Trace the `Lineage` of one of the living particles."""
+    node, nodes = particle, []
     for origin in reversed(tree.origin):
-        row = int(origin[row])
-        rows.append(row)
+        node = int(origin[node])
+        nodes.append(node)
     pose, landmark_id = (
-        np.stack([level[row] for level, row in zip(column, reversed(rows), strict=True)])
+        np.stack([level[node] for level, node in zip(column, reversed(nodes), strict=True)])
         for column in (tree.pose, tree.landmark_id)
     )
     return Lineage(pose.astype(float), landmark_id.astype(np.int64))

@@ -1,11 +1,11 @@
-"""Robust least squares over a whole path and map, associations given (bundle adjustment).
+"""Robust least squares over path and map, with associations given (bundle adjustment).
 
-The model is the filter's: the motion of `motion.model`, the noise of `sensors`, and measurements
-that come from nothing with probability `outlier`, uniformly over the view. A measurement's weight
-is the posterior probability that it does not (the E step of expectation maximisation; the cost is
-the mixture's). A variance that depends on range is held at the current estimate in every iteration
-and is no reason to move (iteratively reweighted least squares). Errors that stay alike along the
-path (`sensors.correlated`) raise the whole density of a measurement to a power below one.
+The model is the filter's: the motion of `motion.model`, the noise of `sensors`, and clutter with
+probability `outlier`, uniform over the view. A measurement's weight is the posterior probability
+that it is an inlier (the E step of expectation maximization; the cost is that of the mixture). A
+variance that depends on range is fixed at the current estimate in every iteration and contributes
+no gradient (iteratively reweighted least squares). Correlated errors (`sensors.correlated_noise`)
+raise the density of a measurement to a power below one, its tempering.
 NumPy in float64, derivatives by JAX in double precision.
 """
 
@@ -21,20 +21,21 @@ from jaxslam.models import sensors
 from jaxslam.parameters import Params
 from jaxslam.smoother import normal_equations, residuals
 
-LEAST_INFORMATION = 1e-6  # 1/m^2 of a point that no measurement holds
+LEAST_INFORMATION = 1e-6  # 1/m^2, added to every point: some have no inlier
 ITERATIONS = 60
-# Squared length of a step that changes nothing, in posterior standard deviations: at the end, and
-# under a wide kernel, which only leads there.
+# Squared length of a step at convergence, in posterior standard deviations: at the end, and under a
+# wide kernel, which only provides a start.
 CLOSE, CLOSE_WIDE = 1e-8, 1e-2
 MOST_DAMPING = 1e8
 DAMPINGS = (0.0, 1e-9, 1e-6, 1e-3, 1.0)
 
 
 class Problem(NamedTuple):
-    """T intervals and M measurements (padding left out), fixed for a whole refinement.
+    """T intervals and M measurements (without padding), fixed during a refinement.
 
-    `odometry` [T]; `frame` [M]; `value` [M, 2]; `cov` [M, 3]; `share` [M]: power of a measurement's
-    density; `start` [3] and `root` [3, 3], an inverse square root of the start's covariance.
+    `odometry` [T]; `frame` [M]; `value` [M, 2]; `cov` [M, 3]; `tempering` [M]: exponent of a
+    measurement's density; `start` [3] and `root` [3, 3], an inverse square root of the start
+    pose's covariance.
     """
 
     sensor: str
@@ -42,16 +43,16 @@ class Problem(NamedTuple):
     frame: np.ndarray
     value: np.ndarray
     cov: np.ndarray
-    share: np.ndarray
+    tempering: np.ndarray
     start: np.ndarray
     root: np.ndarray
     params: Params
 
 
 class Fit(NamedTuple):
-    """Path [T + 1, 3] with the start first, points [L, 2], the normal matrix taken apart, inlier
-    probabilities [M] (0: without a point), points' information [L, 2, 2] were the path known, root
-    mean square of the inliers' standardised residuals, cost (nats), iterations, `converged`."""
+    """`path` [T + 1, 3] from the start pose; `points` [L, 2]; `factor` of the normal matrix;
+    `weight` [M]: inlier probabilities (0: without a point); `information` [L, 2, 2] of the points
+    given the path; `residual`: root mean square of inliers' whitened residuals; `cost` (nats)."""
 
     path: np.ndarray
     points: np.ndarray
@@ -65,19 +66,20 @@ class Fit(NamedTuple):
 
 
 def make_problem(frames, start_pose, start_cov, params, sensor):
-    """`Problem` of `frames.Frames`, and where the measurements stand in it: flat indices [M]."""
+    """Build the `Problem` of `frames.Frames`; also the flat index [M] (frame * K + k) of each
+    measurement."""
     params = Params(*(np.float64(np.asarray(value)) for value in params))
     slots = frames.measurements
     count = slots.valid.shape[1]
-    place = np.flatnonzero(slots.valid & np.asarray(slots.active)[:, None])
-    frame = place // count
+    flat_index = np.flatnonzero(slots.valid & np.asarray(slots.active)[:, None])
+    frame = flat_index // count
     odometry = Odometry(*(np.asarray(part, float) for part in frames.odometry))
     noise = jax.vmap(lambda interval: sensors.correlated_noise(params, interval))(odometry)
-    # All standard deviations are enlarged alike.
-    share = (params.position_scale / np.asarray(noise.position_scale)) ** 2
-    value = np.asarray(slots.value, float).reshape(-1, 2)[place]
+    # All standard deviations are enlarged by the same factor.
+    tempering = (params.position_scale / np.asarray(noise.position_scale)) ** 2
+    value = np.asarray(slots.value, float).reshape(-1, 2)[flat_index]
     if slots.scale is not None:
-        gain = 1 + np.asarray(slots.scale, float).ravel()[place] * (params.gain_tran - 1)
+        gain = 1 + np.asarray(slots.scale, float).ravel()[flat_index] * (params.gain_tran - 1)
         value = value * gain[:, None]
     cov = np.zeros((3, 3)) if start_cov is None else np.asarray(start_cov, float)
     variance, axes = np.linalg.eigh(cov)
@@ -87,36 +89,36 @@ def make_problem(frames, start_pose, start_cov, params, sensor):
         odometry=odometry,
         frame=frame,
         value=value,
-        cov=np.asarray(slots.cov, float).reshape(-1, 3)[place],
-        share=np.broadcast_to(share, len(odometry.dx))[frame],
+        cov=np.asarray(slots.cov, float).reshape(-1, 3)[flat_index],
+        tempering=np.broadcast_to(tempering, len(odometry.dx))[frame],
         start=np.asarray(start_pose, float),
         root=root,
         params=params,
-    ), place
+    ), flat_index
 
 
-def truncate(given, place, done):
-    """The problem of the first `done` intervals, and where its measurements stand."""
-    count = np.searchsorted(given.frame, done)
-    part = {name: getattr(given, name)[:count] for name in ("frame", "value", "cov", "share")}
-    odometry = Odometry(*(leaf[:done] for leaf in given.odometry))
-    return given._replace(odometry=odometry, **part), place[:count]
+def truncate(problem, flat_index, done):
+    """The problem of the first `done` intervals, and the flat indices of its measurements."""
+    count = np.searchsorted(problem.frame, done)
+    part = {name: getattr(problem, name)[:count] for name in ("frame", "value", "cov", "tempering")}
+    odometry = Odometry(*(leaf[:done] for leaf in problem.odometry))
+    return problem._replace(odometry=odometry, **part), flat_index[:count]
 
 
-def solve(given, path, points, which, widths, progress=None):
-    """`Fit` of the path and of points [L, 2], from a start; `which` [M]: point measured, or -1.
+def solve(problem, path, points, which, widths, progress=None):
+    """Compute the `Fit` from an initial path and points [L, 2]; `which` [M]: point measured, or -1.
 
-    `widths`: factors on the measurements' standard deviations in their weights, one after the
-    other: a wide kernel pulls in a poor start (graduated non-convexity, Blake and Zisserman 1987).
+    `widths`: successive factors on the measurements' standard deviations in their weights; a wide
+    kernel makes a poor start converge (graduated non-convexity, Blake and Zisserman 1987).
     """
     total = 0
     for width in widths:
-        path, points, count, converged = _descend(given, path, points, which, width, progress)
+        path, points, count, converged = _descend(problem, path, points, which, width, progress)
         total += count
-    linear = _linearise(given, path, points, which)
-    inlier, cost = _weigh(given, linear, which, 1.0)
-    weight = inlier * given.share
-    normal, factor = _split_unknowns(given, linear, weight, which, len(points))
+    linear = _linearise(problem, path, points, which)
+    inlier, cost = _weigh(problem, linear, which, 1.0)
+    weight = inlier * problem.tempering
+    normal, factor = _factorize(problem, linear, weight, which, len(points))
     sure = inlier > 0.5
     square = linear.seen[0][sure] ** 2
     return Fit(
@@ -132,14 +134,14 @@ def solve(given, path, points, which, widths, progress=None):
     )
 
 
-def _split_unknowns(given, linear, weight, which, size):
-    """The normal matrix and its `chain.Factor`.
+def _factorize(problem, linear, weight, which, size):
+    """Assemble and factorize the normal equations.
 
-    A point that ran off to where nothing holds it makes the matrix singular to rounding: then it is
-    damped, by as little as will do. Such a point has no depth and leaves the map.
+    A point that diverged makes the matrix singular up to rounding: it is then damped as little as
+    possible. Such a point has no depth and leaves the map.
     """
     for damping in DAMPINGS:
-        normal = _assemble(given, linear, weight, which, size, damping)
+        normal = _assemble(problem, linear, weight, which, size, damping)
         try:
             return normal, normal_equations.solve(normal)[2]
         except np.linalg.LinAlgError:
@@ -147,13 +149,13 @@ def _split_unknowns(given, linear, weight, which, size):
                 raise
 
 
-def log_inlier(given, path, point):
-    """log density [M] of all measurements, were they of `point` [2]: that of an inlier."""
-    pose = path[given.frame + 1]
+def log_inlier(problem, path, point):
+    """log inlier density [M] of all measurements if they were of `point` [2]."""
+    pose = path[problem.frame + 1]
     point = np.broadcast_to(point, (len(pose), 2))
-    scale = residuals.scales(given.sensor, pose, point, given.cov, given.params)
-    rest = residuals.innovations(given.sensor, pose, point, given.value, scale, given.params)
-    return _log_density(given, rest, scale)
+    scale = residuals.scales(problem.sensor, pose, point, problem.cov, problem.params)
+    rest = residuals.innovations(problem.sensor, pose, point, problem.value, scale, problem.params)
+    return _log_density(problem, rest, scale)
 
 
 def sensor_poses(path, params):
@@ -164,22 +166,22 @@ def sensor_poses(path, params):
     return np.stack([x + c * mx - s * my, y + s * mx + c * my, heading + params.mount_yaw], -1)
 
 
-def _descend(given, path, points, which, width, progress):
-    """Levenberg and Marquardt's iterations at one width: path, points, how many, whether at rest.
+def _descend(problem, path, points, which, width, progress):
+    """Levenberg-Marquardt iterations at one width: path, points, their number, whether converged.
 
-    Damping scales the information of the motion and of the points, not its diagonal: a bent path
-    can then still straighten as a whole. A step is taken only if the cost falls.
+    Damping scales the information of the motion and of the points, not its diagonal, so that a bent
+    path can still straighten as a whole. A step is taken only if the cost falls.
     """
     damping, close = 0.0, CLOSE if width == 1 else CLOSE_WIDE
     for count in range(1, ITERATIONS + 1):
-        linear = _linearise(given, path, points, which)
-        inlier, cost = _weigh(given, linear, which, width)
-        weight = inlier * given.share
+        linear = _linearise(problem, path, points, which)
+        inlier, cost = _weigh(problem, linear, which, width)
+        weight = inlier * problem.tempering
         while True:
-            normal = _assemble(given, linear, weight, which, len(points), damping)
+            normal = _assemble(problem, linear, weight, which, len(points), damping)
             moved, shifted, gained = _step(normal, path, points)
-            after = _cost(given, moved, shifted, which, linear, width)
-            # No more than this is the squared length of the undamped step.
+            after = _cost(problem, moved, shifted, which, linear, width)
+            # An upper bound of the squared length of the undamped step.
             at_rest = (1 + damping) * gained < close
             if after <= cost or at_rest:
                 break
@@ -197,7 +199,7 @@ def _descend(given, path, points, which, width, progress):
 
 
 def _step(normal, path, points):
-    """The path and the points after a step, and its squared length; NaN where there is none."""
+    """Path and points after a step, and its squared length; NaN if there is no solution."""
     try:
         turn, shift, _ = normal_equations.solve(normal)
     except np.linalg.LinAlgError:
@@ -216,70 +218,70 @@ class _Linear(NamedTuple):
     scales: tuple
 
 
-def _linearise(given, path, points, which):
-    pose, point = path[given.frame + 1], _gather(points, which)
-    scales = residuals.scales(given.sensor, pose, point, given.cov, given.params)
-    moved = residuals.motion_jacobian(path[:-1], path[1:], given.odometry, given.params)
-    seen = residuals.jacobian(given.sensor, pose, point, given.value, scales, given.params)
+def _linearise(problem, path, points, which):
+    pose, point = path[problem.frame + 1], _measured_points(points, which)
+    scales = residuals.scales(problem.sensor, pose, point, problem.cov, problem.params)
+    moved = residuals.motion_jacobian(path[:-1], path[1:], problem.odometry, problem.params)
+    seen = residuals.jacobian(problem.sensor, pose, point, problem.value, scales, problem.params)
     return _Linear(
-        start=(_start(given, path), given.root),
+        start=(_start_residual(problem, path), problem.root),
         moved=moved,
         seen=seen,
         scales=scales,
     )
 
 
-def _gather(points, which):
-    """The point [M, 2] of every measurement; the origin for none."""
+def _measured_points(points, which):
+    """The point [M, 2] of every measurement; the origin where there is none."""
     return np.vstack([points, np.zeros((1, 2))])[which]
 
 
-def _start(given, path):
-    off = path[0] - given.start
+def _start_residual(problem, path):
+    off = path[0] - problem.start
     off[2] -= 2 * np.pi * np.round(off[2] / (2 * np.pi))
-    return given.root @ off
+    return problem.root @ off
 
 
-def _log_density(given, rest, scale, width=1.0):
-    """log of (1 - outlier) x normal [M] of whitened residuals [M, m], `width` times as wide."""
+def _log_density(problem, rest, scale, width=1.0):
+    """log of (1 - outlier) x normal density [M] of whitened residuals [M, m], at this width."""
     m = rest.shape[1]
     normaliser = np.sum(np.log(scale[:, :m]), 1) - m * (np.log(width) + sensors.LOG_2PI / 2)
     square = np.sum(rest**2, 1) / width**2
-    return np.log1p(-given.params.outlier) + normaliser - square / 2
+    return np.log1p(-problem.params.outlier) + normaliser - square / 2
 
 
-def _mixture(given, rest, scale, which, width):
+def _mixture(problem, rest, scale, which, width):
     """log odds of being an inlier [M], and the measurements' part of the cost.
 
-    The cost is times the square of the width: a sure inlier counts the same at every width.
+    The cost is multiplied by the squared width, so that a certain inlier counts the same at all.
     """
-    normal = _log_density(given, rest, scale, width)
+    normal = _log_density(problem, rest, scale, width)
     with np.errstate(divide="ignore"):
-        clutter = np.asarray(sensors.log_clutter_density(given.sensor, given.params))
+        clutter = np.asarray(sensors.log_clutter_density(problem.sensor, problem.params))
     both = np.logaddexp(normal, clutter)
-    return normal - clutter, -(width**2) * np.sum((given.share * both)[which >= 0])
+    return normal - clutter, -(width**2) * np.sum((problem.tempering * both)[which >= 0])
 
 
-def _weigh(given, linear, which, width):
-    """Inlier probabilities [M], and the cost (nats, variances held)."""
-    odds, cost = _mixture(given, linear.seen[0], linear.scales, which, width)
+def _weigh(problem, linear, which, width):
+    """Inlier probabilities [M], and the cost (nats, variances fixed)."""
+    odds, cost = _mixture(problem, linear.seen[0], linear.scales, which, width)
     squares = np.sum(linear.start[0] ** 2) + np.sum(linear.moved[0] ** 2)
     return np.where(which >= 0, expit(odds), 0.0), float(cost + squares / 2)
 
 
-def _cost(given, path, points, which, linear, width):
-    """The cost elsewhere, with the variances of `linear`."""
-    pose, point = path[given.frame + 1], _gather(points, which)
+def _cost(problem, path, points, which, linear, width):
+    """The cost at another path and points, with the variances of `linear`."""
+    pose, point = path[problem.frame + 1], _measured_points(points, which)
     rest = residuals.innovations(
-        given.sensor, pose, point, given.value, linear.scales, given.params
+        problem.sensor, pose, point, problem.value, linear.scales, problem.params
     )
-    _, cost = _mixture(given, rest, linear.scales, which, width)
-    moved = residuals.motions(path[:-1], path[1:], given.odometry, given.params)
-    return float(cost + (np.sum(_start(given, path) ** 2) + np.sum(moved**2)) / 2)
+    _, cost = _mixture(problem, rest, linear.scales, which, width)
+    moved = residuals.motion_residuals(path[:-1], path[1:], problem.odometry, problem.params)
+    return float(cost + (np.sum(_start_residual(problem, path) ** 2) + np.sum(moved**2)) / 2)
 
 
-def _assemble(given, linear, weight, which, size, damping):
-    """`chain.Normal` of the linearised, weighted problem with `size` points."""
+def _assemble(problem, linear, weight, which, size, damping):
+    """`NormalEquations` of the linearised, weighted problem with `size` points."""
     (rest, before, after), more = linear.moved, 1 + damping
     diagonal = np.zeros((len(rest) + 1, 3, 3))
     diagonal[0] = more * linear.start[1].T @ linear.start[1]
@@ -292,7 +294,7 @@ def _assemble(given, linear, weight, which, size, damping):
 
     used = which >= 0
     rest, by_pose, by_point = (part[used] for part in linear.seen)
-    which, pose, weight = which[used], given.frame[used] + 1, weight[used, None, None]
+    which, pose, weight = which[used], problem.frame[used] + 1, weight[used, None, None]
     diagonal += segment_sums(pose, weight * _outer(by_pose, by_pose), len(diagonal))
     drive = -weight[:, 0] * np.einsum("mij,mi->mj", by_pose, rest)
     pose_gradient += segment_sums(pose, drive, len(diagonal))
@@ -304,7 +306,7 @@ def _assemble(given, linear, weight, which, size, damping):
     border = coo_array(
         (block.ravel(), (row.ravel(), column.ravel())), (2 * size, 3 * len(diagonal))
     )
-    return normal_equations.Normal(
+    return normal_equations.NormalEquations(
         diagonal=diagonal,
         off=more * _outer(before, after),
         border=border.tocsr(),
@@ -320,8 +322,8 @@ def _outer(a, b):
 
 
 def segment_sums(index, parts, size):
-    """Sums [size, ...] of the parts [M, ...] that share an index."""
+    """Sum the parts [M, ...] that share an index: [size, ...]."""
     inner = int(np.prod(parts.shape[1:]))
-    place = index[:, None] * inner + np.arange(inner)
-    total = np.bincount(place.ravel(), parts.ravel(), size * inner)
+    flat_index = index[:, None] * inner + np.arange(inner)
+    total = np.bincount(flat_index.ravel(), parts.ravel(), size * inner)
     return total.reshape(size, *parts.shape[1:])

@@ -1,9 +1,9 @@
-"""Refining one lineage: its whole path and map by least squares, its associations checked again.
+"""Refinement of one lineage: least squares over its path and map, alternating with reassociation.
 
-A particle's past is fixed once its relatives have died out; what it took each measurement for is
-usually right all the same. So: solve for path and map with the associations given (`bundle`), then
-merge landmarks that turn out to be one, let every measurement choose again, drop landmarks that
-too little speaks for (`regroup`), and repeat until nothing changes.
+The filter never revises a particle's path, but its associations are usually right. So: solve for
+path and map with the associations given (`least_squares`), then merge landmarks that coincide, let
+every measurement choose again, drop landmarks with too little evidence (`reassociation`), and
+repeat until nothing changes.
 """
 
 from typing import NamedTuple
@@ -14,10 +14,10 @@ import numpy as np
 from jaxslam.smoother import least_squares, normal_equations, reassociation
 
 ROUNDS, ROUNDS_AGAIN = 10, 3
-MISTAKEN = 1e-4  # probability, at least, that a measurement was taken for the wrong landmark
-TRIES = 3  # times that a landmark may enter the map
-LARGE = 40_000_000  # frames times landmarks, from which on those seen once are left out
-WIDE, WIDER, NARROW = (8.0, 4.0, 2.0, 1.0), (4.0, 2.0, 1.0), (1.0,)  # kernels: `bundle.fit`
+MISTAKEN = 1e-4  # least probability that a measurement is of another landmark
+TRIES = 3  # how often a landmark may enter the map
+LARGE = 40_000_000  # frames times landmarks above which those measured once are left out
+WIDE, WIDER, NARROW = (8.0, 4.0, 2.0, 1.0), (4.0, 2.0, 1.0), (1.0,)  # kernels
 
 
 class Refined(NamedTuple):
@@ -25,10 +25,10 @@ class Refined(NamedTuple):
 
     `pose` [T, 3], `cov` [T, 3, 3]; `id` [L]: frame * K + k of the measurement that began it; `mean`
     [L, 2] m, `landmark_cov` [L, 3] (xx, xy, yy); `n` [L] measurements used; `identity` [L]: index
-    of the identity, -1 if hidden. `landmark_id` [T, K] as `Result.landmark_id`. `cost`: nats. `converged`: the
-    last solution is at rest and its associations are too. `merged`: landmarks that were another
-    one; `dropped`: that had too few measurements or no depth. `residual`: root mean square of the
-    inliers' standardised residuals. Covariances are those for the associations made.
+    of the identity, -1 if hidden. `landmark_id` [T, K] as in `Result`. `cost`: nats. `converged`:
+    solution and associations no longer change. `merged`: number of landmarks merged into others;
+    `dropped`: of those with too few measurements or no depth. `residual`: root mean square of the
+    inliers' whitened residuals. Covariances take the associations as certain.
     """
 
     pose: np.ndarray
@@ -54,8 +54,8 @@ class Refined(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """`bundle.Fit` of the last round and the `regroup.Groups` it is of; `merged`: pairs of labels,
-    a landmark and what it was merged with; `converged` as in `Refined`."""
+    """The `fit` of the last round, with its `groups`; `merged`: pairs of landmark ids (merged, and
+    merged into); `converged` as in `Refined`."""
 
     fit: least_squares.Fit
     groups: reassociation.Groups
@@ -68,27 +68,32 @@ class Solved(NamedTuple):
 def refine(
     frames, pose, landmark_id, start_pose, start_cov, params, sensor, known=False, progress=None
 ):
-    """`Refined` of one lineage: `pose` [T, 3] and `landmark_id` [T, K] (as `filter.Info.landmark_id`).
+    """Refine one lineage, `pose` [T, 3] and `landmark_id` [T, K] (as in `step.Info`): `Refined`.
 
-    `frames`: `frames.Frames` of T frames. `known`: identities say which landmark was measured, and
-    `landmark_id` is not used. `start_cov` [3, 3]: zero (or None) where the start is known. `progress` is
-    called with (iterations done, cost). Raises `ValueError` for arrays that do not fit.
+    `frames`: `Frames` of T frames. `known`: landmarks are those of the log's identities, and
+    `landmark_id` is not used. `start_cov` [3, 3]: zero (or None) where the start is known.
+    `progress` is called with (iterations done, cost). Raises `ValueError` for arrays of wrong shape
+    or with values that are not finite.
     """
     shape = np.shape(frames.measurements.valid)
     _check("pose", pose, (shape[0], 3))
     _check("landmark_id", landmark_id, shape)
     identity = np.asarray(frames.measurements.identity).ravel()
     with jax.enable_x64(True):
-        params = params if known else is_doubtful(params)
-        given, place = least_squares.make_problem(frames, start_pose, start_cov, params, sensor)
-        name = identity[place] if known else np.asarray(landmark_id).ravel()[place]
-        found = solve_and_reassociate(given, place, pose, name, known, progress=progress)
-    return _to_refined(found, given, place, shape, identity if known else None)
+        params = params if known else allow_mistakes(params)
+        problem, flat_index = least_squares.make_problem(
+            frames, start_pose, start_cov, params, sensor
+        )
+        measured = identity if known else np.asarray(landmark_id).ravel()
+        found = solve_and_reassociate(
+            problem, flat_index, pose, measured[flat_index], known, progress=progress
+        )
+    return _to_refined(found, problem, flat_index, shape, identity if known else None)
 
 
-def is_doubtful(params):
-    """The parameters where identities are hidden: a measurement may be of something else, even of a
-    sensor that has no clutter."""
+def allow_mistakes(params):
+    """The parameters for unknown data association: a measurement may be of another landmark, even
+    if the sensor has no clutter."""
     return params._replace(outlier=max(float(params.outlier), MISTAKEN))
 
 
@@ -99,111 +104,116 @@ def _check(name, value, shape):
         raise ValueError(f"{name}: not all finite")
 
 
-def _groups(name, place, known):
-    """`Groups` of measurements at `place` by name: identities, or births (-1: its own place)."""
-    none = name < 0 if known else (name == -2) | (name == -3)
-    name = np.where(name == -1, place, name)
-    label, first, of = np.unique(name[~none], return_index=True, return_inverse=True)
-    group = np.full(len(name), -1)
-    group[~none] = of
-    label = place[~none][first] if known else label
-    return reassociation.Groups(group, label, np.full((len(label), 2), np.nan))
+def _group_measurements(measured, flat_index, known):
+    """Group the measurements by what is `measured` [M]: identities, or landmark ids (-1: a new
+    landmark, whose id is the measurement's flat index)."""
+    none = measured < 0 if known else (measured == -2) | (measured == -3)
+    measured = np.where(measured == -1, flat_index, measured)
+    landmark_id, first, group = np.unique(measured[~none], return_index=True, return_inverse=True)
+    assignment = np.full(len(measured), -1)
+    assignment[~none] = group
+    landmark_id = flat_index[~none][first] if known else landmark_id
+    return reassociation.Groups(assignment, landmark_id, np.full((len(landmark_id), 2), np.nan))
 
 
-def _reobserve(groups):
-    """`Groups` without those of one measurement, which tell nothing of the path: where much is
-    clutter, or the map was full, they are far more than the rest, and matrices of all of them would
-    not fit."""
-    again = np.bincount(groups.of[groups.of >= 0], minlength=len(groups.label)) > 1
+def _drop_single_measurements(groups):
+    """`Groups` without those of a single measurement, which do not constrain the path: with much
+    clutter, or when the map was full, they are so many that the matrices would not fit."""
+    again = (
+        np.bincount(groups.assignment[groups.assignment >= 0], minlength=len(groups.landmark_id))
+        > 1
+    )
     number = np.append(np.where(again, np.cumsum(again) - 1, -1), -1)
-    return reassociation.Groups(number[groups.of], groups.label[again], groups.point[again])
+    return reassociation.Groups(
+        number[groups.assignment], groups.landmark_id[again], groups.point[again]
+    )
 
 
-def solve_and_reassociate(given, place, pose, name, known, again=False, progress=None):
-    """Solve and check again until nothing changes: `Solved`.
+def solve_and_reassociate(problem, flat_index, pose, measured, known, again=False, progress=None):
+    """Solve and reassociate until nothing changes: `Solved`.
 
-    `place` [M]: of the measurements, as `bundle.problem` has it; `pose` [T, 3]; `name` [M]: their
-    identities if they are `known`, else their landmarks' births. `again`: most of it was refined
-    before and will be again, so fewer rounds will do, and landmarks may yet earn their place.
+    `flat_index` [M] as from `make_problem`; `pose` [T, 3]; `measured` [M]: identities if they are
+    `known`, else landmark ids. `again`: for rejuvenation, where most of the path was refined before
+    and will be again: fewer rounds, and landmarks need not be confirmed yet.
     """
     widths, most = (NARROW, ROUNDS_AGAIN) if again else (WIDE, ROUNDS)
-    groups = _groups(name, place, known)
-    if not known and len(pose) * len(groups.label) > LARGE:
-        groups = _reobserve(groups)
-    path = np.vstack([given.start, pose]).astype(float)
-    done, iterations, merged = 0, 0, []
-    tries = np.full(len(groups.label), TRIES)
-    groups = _locate(given, path, groups, tries)
+    groups = _group_measurements(measured, flat_index, known)
+    if not known and len(pose) * len(groups.landmark_id) > LARGE:
+        groups = _drop_single_measurements(groups)
+    path = np.vstack([problem.start, pose]).astype(float)
+    rounds, iterations, merged = 0, 0, []
+    tries = np.full(len(groups.landmark_id), TRIES)
+    groups = _locate(problem, path, groups, tries)
     while True:
-        rows, which = reassociation.in_field_of_view(groups)
-        fit = least_squares.solve(given, path, groups.point[rows], which, widths, progress)
-        path, done, iterations = fit.path, done + 1, iterations + fit.iterations
-        groups.point[rows] = fit.points
-        after, pairs = reassociation.check_groups(given, fit, groups, known, not again)
-        after = _locate(given, path, after, tries)
-        settled = np.array_equal(after.of, groups.of) and np.array_equal(
+        mapped, which = reassociation.index_mapped(groups)
+        fit = least_squares.solve(problem, path, groups.point[mapped], which, widths, progress)
+        path, rounds, iterations = fit.path, rounds + 1, iterations + fit.iterations
+        groups.point[mapped] = fit.points
+        after, pairs = reassociation.check_groups(problem, fit, groups, known, not again)
+        after = _locate(problem, path, after, tries)
+        unchanged = np.array_equal(after.assignment, groups.assignment) and np.array_equal(
             np.isfinite(after.point), np.isfinite(groups.point)
         )
-        if settled or done == most:
-            converged = bool(settled and fit.converged)
-            return Solved(fit, groups, merged, done, iterations, converged)
+        if unchanged or rounds == most:
+            converged = bool(unchanged and fit.converged)
+            return Solved(fit, groups, merged, rounds, iterations, converged)
         merged += pairs
         widths = WIDER if pairs else NARROW
         groups = after
 
 
-def _locate(given, path, groups, tries):
-    """`regroup.located` of the groups that still have a try: one whose depth is at the limit would
-    come and go for ever. Counts `tries` [G] down."""
-    after = reassociation.locate(given, path, groups)
+def _locate(problem, path, groups, tries):
+    """`reassociation.locate` for groups with `tries` [G] left, which it counts down: a landmark of
+    barely sufficient depth would enter and leave the map forever."""
+    after = reassociation.locate(problem, path, groups)
     new = np.isfinite(after.point[:, 0]) & ~np.isfinite(groups.point[:, 0])
     tries[new] -= 1
     return after._replace(point=np.where((new & (tries < 0))[:, None], np.nan, after.point))
 
 
-def landmark_ids(found, place, shape):
-    """What each measurement was taken for [T, K] (`shape`), as `Result.landmark_id`; where the landmark
-    has no depth yet, its label all the same."""
+def landmark_ids(found, flat_index, shape):
+    """Landmark id of each measurement [T, K] (`shape`), as in `Result`, also of landmarks that have
+    no depth yet."""
     groups = found.groups
-    _, which = reassociation.in_field_of_view(groups)
-    used = (groups.of >= 0) & ((which < 0) | (found.fit.weight > 0.5))
-    label = np.where(used, np.append(groups.label, -2)[groups.of], -2)
+    _, which = reassociation.index_mapped(groups)
+    used = (groups.assignment >= 0) & ((which < 0) | (found.fit.weight > 0.5))
+    measured = np.where(used, np.append(groups.landmark_id, -2)[groups.assignment], -2)
     landmark_id = np.full(shape, -3).ravel()
-    landmark_id[place] = np.where(label == place, -1, label)
+    landmark_id[flat_index] = np.where(measured == flat_index, -1, measured)
     return landmark_id.reshape(shape)
 
 
-def _to_refined(found, given, place, shape, identities):
-    """`Refined` from the last round; points without an inlier or a depth are left out."""
+def _to_refined(found, problem, flat_index, shape, identities):
+    """Build `Refined` from the last round, without points that have no inlier or no depth."""
     fit, groups = found.fit, found.groups
-    rows, which = reassociation.in_field_of_view(groups)
+    mapped, which = reassociation.index_mapped(groups)
     sure = fit.weight > 0.5
-    n = np.bincount(which[sure], minlength=len(rows))
+    n = np.bincount(which[sure], minlength=len(mapped))
     kept = n > 0
-    if given.sensor == "bearing":
-        kept &= reassociation.is_locatable(given, fit, which)
-    cov = fit.factor.points.reshape(len(rows), 2, len(rows), 2)
-    every = np.arange(len(rows))
+    if problem.sensor == "bearing":
+        kept &= reassociation.has_depth(problem, fit, which)
+    cov = fit.factor.points.reshape(len(mapped), 2, len(mapped), 2)
+    every = np.arange(len(mapped))
     own = cov[every, :, every][kept]
-    identity = np.full(len(groups.label), -1)
+    identity = np.full(len(groups.landmark_id), -1)
     if identities is not None:
-        identity = identities[groups.label]
+        identity = identities[groups.landmark_id]
     pose = fit.path[1:].copy()
     pose[:, 2] = (pose[:, 2] + np.pi) % (2 * np.pi) - np.pi
     return Refined(
         pose=pose,
         cov=normal_equations.pose_covariances(fit.factor)[1:],
-        id=groups.label[rows][kept],
+        id=groups.landmark_id[mapped][kept],
         mean=fit.points[kept],
         landmark_cov=np.stack([own[:, 0, 0], own[:, 0, 1], own[:, 1, 1]], 1),
         n=n[kept],
-        identity=identity[rows][kept],
-        landmark_id=landmark_ids(found, place, shape),
+        identity=identity[mapped][kept],
+        landmark_id=landmark_ids(found, flat_index, shape),
         rounds=found.rounds,
         iterations=found.iterations,
         cost=fit.cost,
         converged=found.converged,
         merged=len(found.merged),
-        dropped=len(groups.label) - len(found.merged) - int(kept.sum()),
+        dropped=len(groups.landmark_id) - len(found.merged) - int(kept.sum()),
         residual=fit.residual,
     )

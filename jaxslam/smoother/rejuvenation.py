@@ -1,11 +1,10 @@
-"""The filter given a new past now and then: particles redrawn from the refined path and map.
+"""Rejuvenation: redraw all particles from the refined path and map of the best one.
 
-Resampling leaves all particles one common past, whose errors no weight can correct any more, and
-whose covariance says nothing. So, each time the robot has driven some metres, the best particle's
-past with its associations is refined by least squares (`refine`), its measurements choose their
-landmarks anew, landmarks that turn out to be one are merged, and whole paths with their maps are
-drawn from the Gaussian of what was refined (`redraw`). It happens after fixed frames of the log, so
-that neither chunks, nor resuming, nor devices make a difference.
+Resampling leaves all particles one shared past, whose errors no weight can correct any more, and
+whose covariance is meaningless. So, each time the robot has driven some metres, the best particle's
+lineage is refined and reassociated (`refine`), and paths with their maps are drawn from the
+Gaussian of the result (`posterior_sampling`). This happens after fixed frames of the log, so that
+chunks, resuming and devices make no difference.
 """
 
 from functools import partial
@@ -26,14 +25,15 @@ from jaxslam.smoother import (
 )
 from jaxslam.smoother.events import DROPPED, FAILED, FOUND, MERGED
 
-GROWTH = 0.05  # of the path so far: the least between two rejuvenations of a long run
+GROWTH = 0.05  # fraction of the path so far, at least, between two rejuvenations of a long run
 SURE = 0.5  # probability above which a measurement is an inlier
 
 
 class SharedPast(NamedTuple):
-    """What all particles share of t frames: `pose` [t, 3] and `landmark_id` [t, K] as refined, in the
-    frame of the filter; `cov` [t, 3, 3], empty but for the last time. `event` [E, 4]: frames done,
-    kind (`events.KINDS`), the landmark's `id`, and what it was merged with (-1)."""
+    """The t frames before the last rejuvenation, common to all particles: refined `pose` [t, 3] and
+    `landmark_id` [t, K], in the frame of the filter; `cov` [t, 3, 3], empty before the run's last
+    rejuvenation. `event` [E, 4]: frames done, kind (`events.KINDS`), landmark id, and the id that
+    it was merged into (-1)."""
 
     pose: np.ndarray
     cov: np.ndarray
@@ -42,7 +42,7 @@ class SharedPast(NamedTuple):
 
 
 def empty_past(slots):
-    """`Past` of no frames, K measurements wide."""
+    """Make the `SharedPast` of no frames, for K = `slots` measurements a frame."""
     return SharedPast(
         np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, slots), np.int64),
         np.zeros((0, 4), np.int64),
@@ -50,68 +50,73 @@ def empty_past(slots):
 
 
 def due_frames(odometry, every):
-    """Numbers of frames done after which it is time: `every` so many metres driven, or a share of
-    the path so far; nothing for 0."""
+    """List after how many frames to rejuvenate: every `every` metres (0: never), and at least
+    `GROWTH` of the path so far."""
     path = np.cumsum(np.asarray(odometry.distance, float))
-    found, last = [], 0.0
+    due, last = [], 0.0
     for done, length in enumerate(path[:-1].tolist() if every else [], 1):
         if length - last >= max(every, GROWTH * last):
-            found.append(done)
+            due.append(done)
             last = length
-    return found
+    return due
 
 
 class Rejuvenator:
-    """What it takes to give a run's particles a new past: its log, as refinement sees it."""
+    """Rejuvenates the particles of one run; holds its log as a `least_squares.Problem`."""
 
     def __init__(self, data, log, origin, params, config):
         self.due = frozenset(due_frames(data.odometry, config.rejuvenate))
         self._config, self._known = config, config.association == "known"
         self._identity = np.asarray(data.measurements.identity).ravel()
-        params = params if self._known else refine.is_doubtful(params)
+        params = params if self._known else refine.allow_mistakes(params)
         if self.due and sharding.is_leader():
             with jax.enable_x64(True):
-                self._given, self._place = least_squares.make_problem(
+                self._problem, self._flat_index = least_squares.make_problem(
                     data, log.start_pose - origin, log.start_cov, params, config.sensor
                 )
 
-    def rejuvenated(self, key, state, past, lineage, done, best):
-        """`State` after `done` frames drawn anew, the new `Past`, and landmarks lost for want of a
-        slot (None: it failed, and state and past are as they were); `lineage`: of the particle
-        `best`, since the last time (None: of another process). The state given is settled
-        (`filter.settled`), and is given up."""
-        young = _young(state, best, self._config)
+    def rejuvenate(self, key, state, past, lineage, done, best):
+        """Redraw the `State` after `done` frames: the new state, the new `SharedPast`, and how many
+        landmarks were lost because no slot was free (None: refinement failed, nothing changed).
+
+        `lineage`: of the particle `best` since the last rejuvenation (None on processes other than
+        the leader). Landmarks of the state are up to date (no lazy copies); it is donated.
+        """
+        best_particle = _take_particle(state, best, self._config)
         joint, lost = (
             posterior_sampling.empty_joint(self._config.landmarks)._replace(used=np.int32(0)),
             0,
         )
         if sharding.is_leader():
-            young = jax.tree.map(np.asarray, young)
+            best_particle = jax.tree.map(np.asarray, best_particle)
             try:
-                past, joint, lost = self._looked_back(past, lineage, done, young)
-            except np.linalg.LinAlgError:  # a past that can't be refined stays as it is
+                past, joint, lost = self._refine(past, lineage, done, best_particle)
+            except np.linalg.LinAlgError:  # a past that can't be refined stays unchanged
                 past = empty_past(lineage.landmark_id.shape[1]) if past is None else past
                 event = np.vstack([past.event, [[done, FAILED, -1, -1]]])
                 past = past._replace(event=event)
         joint = sharding.broadcast(joint)
         if joint.used == 0:
             return state, past, None
-        looks = state.looks
-        for leaf in jax.tree.leaves(state._replace(looks=None)):  # no two maps at once
+        appearances = state.appearances
+        for leaf in jax.tree.leaves(state._replace(appearances=None)):  # never two maps in memory
             leaf.delete()
-        return posterior_sampling.draw_state(key, joint, done, self._config, looks), past, lost
+        state = posterior_sampling.draw_state(key, joint, done, self._config, appearances)
+        return state, past, lost
 
-    def _looked_back(self, past, lineage, done, young):
-        """The new `Past`, `redraw.Joint` and how many landmarks it has no slot for."""
+    def _refine(self, past, lineage, done, best_particle):
+        """Refine past and lineage: `SharedPast`, `Joint`, number of landmarks without a slot."""
         past = empty_past(lineage.landmark_id.shape[1]) if past is None else past
         pose = np.concatenate([past.pose, lineage.pose])
         landmark_id = np.concatenate([past.landmark_id, lineage.landmark_id])
         with jax.enable_x64(True):
-            given, place = least_squares.truncate(self._given, self._place, done)
-            name = self._identity[place] if self._known else landmark_id.ravel()[place]
-            found = refine.solve_and_reassociate(given, place, pose, name, self._known, again=True)
-        joint, lost, held = self._joint(found, given, place, young)
-        before = _held(past)
+            problem, flat_index = least_squares.truncate(self._problem, self._flat_index, done)
+            measured = (self._identity if self._known else landmark_id.ravel())[flat_index]
+            found = refine.solve_and_reassociate(
+                problem, flat_index, pose, measured, self._known, again=True
+            )
+        joint, lost, held = self._joint(found, problem, best_particle)
+        before = _mapped_landmarks(past)
         event = [[done, MERGED, a, b] for a, b in found.merged]
         gone = before - held - {a for a, _ in found.merged}
         event += [[done, DROPPED, a, -1] for a in sorted(gone)]
@@ -119,114 +124,117 @@ class Rejuvenator:
         event = np.array(event, np.int64).reshape(-1, 4)
         path = found.fit.path[1:].copy()
         path[:, 2] = wrap(path[:, 2])
-        # Of the last time alone: no other is looked at.
+        # Of the last rejuvenation only: no other is used.
         cov = (
             normal_equations.pose_covariances(found.fit.factor)[1:]
             if done == max(self.due)
             else past.cov
         )
-        match = refine.landmark_ids(found, place, landmark_id.shape)
-        return SharedPast(path, cov, match, np.concatenate([past.event, event])), joint, lost
+        refined_id = refine.landmark_ids(found, flat_index, landmark_id.shape)
+        return SharedPast(path, cov, refined_id, np.concatenate([past.event, event])), joint, lost
 
-    def _joint(self, found, given, place, young):
-        """`redraw.Joint`, how many landmarks it has no slot for, and labels of those it holds."""
+    def _joint(self, found, problem, best_particle):
+        """`Joint` of a solution, number of landmarks without a slot, and ids of the others."""
         fit, groups = found.fit, found.groups
-        rows, which = reassociation.in_field_of_view(groups)
+        mapped, which = reassociation.index_mapped(groups)
         sure = (which >= 0) & (fit.weight > SURE)
-        seen = np.bincount(which[sure], minlength=len(rows))
-        slots, lost = self._slots(groups.label[rows], seen, place)
+        seen = np.bincount(which[sure], minlength=len(mapped))
+        slots, lost = self._slots(groups.landmark_id[mapped], seen)
         joint = posterior_sampling.empty_joint(self._config.landmarks)
         cov = posterior_sampling.covariance(fit)
         kept = np.flatnonzero(slots >= 0)
         index = np.concatenate([np.arange(3), *(3 + 2 * i + np.arange(2) for i in kept)])
-        to = np.concatenate([np.arange(3), *(3 + 2 * slots[i] + np.arange(2) for i in kept)])
-        joint.root[to, : len(index)] = posterior_sampling.factor_of(cov[np.ix_(index, index)])
+        target = np.concatenate([np.arange(3), *(3 + 2 * slots[i] + np.arange(2) for i in kept)])
+        joint.root[target, : len(index)] = posterior_sampling.factor_of(cov[np.ix_(index, index)])
         joint.pose[:] = fit.path[-1]
         own = np.linalg.cholesky(np.linalg.inv(fit.information))
-        sensor = least_squares.sensor_poses(fit.path[given.frame + 1], given.params)[:, :2]
-        p = given.params
-        odds = reassociation.existence(given, fit, reassociation.frames_seen(given, fit, which))
+        sensor = least_squares.sensor_poses(fit.path[problem.frame + 1], problem.params)[:, :2]
+        p = problem.params
+        odds = reassociation.existence(problem, fit, reassociation.frames_seen(problem, fit, which))
         for i in kept:
-            s, mine = slots[i], sensor[sure & (which == i)]
+            s, viewpoints = slots[i], sensor[sure & (which == i)]
             joint.kind[s], joint.mean[:, s] = posterior_sampling.POINT, fit.points[i]
             joint.factor[:, s] = own[i][[0, 1, 1], [0, 0, 1]]
-            joint.anchor[:, s] = _middle(mine, fit.points[i])
+            joint.anchor[:, s] = _median_viewpoint(viewpoints, fit.points[i])
             joint.log_odds[s] = min(max(odds[i], 0), p.existence_max)
-            joint.count[s], joint.landmark_id[s] = seen[i], groups.label[rows[i]]
-        waiting = np.unique(groups.of[(groups.of >= 0) & (which < 0)])
-        # Only bearings leave a depth open.
-        waiting = waiting[: len(waiting) if given.sensor == "bearing" else 0]
-        lost += self._carry(joint, young, groups.label[waiting])
-        held = set(groups.label[rows[kept]].tolist())
+            joint.count[s], joint.landmark_id[s] = seen[i], groups.landmark_id[mapped[i]]
+        waiting = np.unique(groups.assignment[(groups.assignment >= 0) & (which < 0)])
+        # Only bearings leave a depth unknown.
+        waiting = waiting[: len(waiting) if problem.sensor == "bearing" else 0]
+        lost += self._copy_unknown_depths(joint, best_particle, groups.landmark_id[waiting])
+        held = set(groups.landmark_id[mapped[kept]].tolist())
         return joint._replace(used=np.int32(len(index))), lost, held
 
-    def _slots(self, label, seen, place):
-        """A slot for every point (-1: never measured, or none left; those measured most come
-        first), and how many find none."""
-        slots, there = np.full(len(label), -1), np.flatnonzero(seen)
+    def _slots(self, landmark_id, seen):
+        """Assign slots to points, those measured most first (-1: never measured, or no slot free);
+        also the number of points without one."""
+        slots, measured = np.full(len(landmark_id), -1), np.flatnonzero(seen)
         if self._known:
-            slot = self._identity[label[there]]
+            slot = self._identity[landmark_id[measured]]
             fits = slot < self._config.landmarks
-            slots[there[fits]] = slot[fits]
-            return slots, 0  # the filter counts those without a slot whenever they are seen
-        order = there[np.argsort(-seen[there], kind="stable")][: self._config.landmarks]
+            slots[measured[fits]] = slot[fits]
+            return slots, 0  # the filter counts those without a slot itself
+        order = measured[np.argsort(-seen[measured], kind="stable")][: self._config.landmarks]
         slots[np.sort(order)] = np.arange(len(order))
-        return slots, len(there) - len(order)
+        return slots, len(measured) - len(order)
 
-    def _carry(self, joint, young, waiting):
-        """Take over the best particle's landmarks of unknown depth; how many find no slot."""
-        wanted = (young.landmarks.count > 0) & np.isin(young.landmarks.landmark_id, waiting)
+    def _copy_unknown_depths(self, joint, best_particle, waiting):
+        """Copy the landmarks `waiting` (ids) from the best particle; returns how many had none."""
+        held = best_particle.landmarks
+        wanted = (held.count > 0) & np.isin(held.landmark_id, waiting)
         free = np.flatnonzero(joint.kind == posterior_sampling.NONE)
-        from_ = np.flatnonzero(wanted)
+        source = np.flatnonzero(wanted)
         if self._known:
-            from_ = np.intersect1d(from_, free)
-            to = from_
+            source = np.intersect1d(source, free)
+            target = source
         else:
-            to = free[: len(from_)]
-        lost, from_ = len(from_) - len(to), from_[: len(to)]
-        x, y, heading = young.pose.astype(float)
-        held = young.landmarks
-        joint.kind[to] = posterior_sampling.YOUNG
-        joint.mean[:, to], joint.factor[:, to] = held.mean[:, from_], held.factor[:, from_]
+            target = free[: len(source)]
+        lost, source = len(source) - len(target), source[: len(target)]
+        x, y, heading = best_particle.pose.astype(float)
+        joint.kind[target] = posterior_sampling.UNKNOWN_DEPTH
+        joint.mean[:, target], joint.factor[:, target] = (
+            held.mean[:, source],
+            held.factor[:, source],
+        )
         for name in ("count", "landmark_id", "log_odds"):
             if getattr(held, name) is not None:
-                getattr(joint, name)[to] = getattr(held, name)[from_]
+                getattr(joint, name)[target] = getattr(held, name)[source]
         if held.anchor is not None:
-            joint.mean[0, to] -= heading
-            away = held.anchor[:, from_] - np.array([[x], [y]])
+            joint.mean[0, target] -= heading
+            away = held.anchor[:, source] - np.array([[x], [y]])
             c, s = np.cos(heading), np.sin(heading)
-            joint.anchor[:, to] = [c * away[0] + s * away[1], c * away[1] - s * away[0]]
+            joint.anchor[:, target] = [c * away[0] + s * away[1], c * away[1] - s * away[0]]
         return lost
 
 
-class _Lane(NamedTuple):
+class _Particle(NamedTuple):
     pose: jax.Array
     landmarks: tuple
 
 
-def _young(state, best, config):
+def _take_particle(state, best, config):
     """Pose [3] and landmarks [..., M] of one particle, on every process."""
-    return _lane(state.pose, state.landmarks, jnp.int32(best), config)
+    return _index_particle(state.pose, state.landmarks, jnp.int32(best), config)
 
 
 @partial(jax.jit, static_argnames="config")
-def _lane(pose, world, best, config):
-    found = _Lane(pose[:, best], jax.tree.map(lambda leaf: leaf[..., best], world))
+def _index_particle(pose, world, best, config):
+    found = _Particle(pose[:, best], jax.tree.map(lambda leaf: leaf[..., best], world))
     if config.devices == 1:
         return found
     everywhere = sharding.shardings(sharding.replicated(found), config)
     return jax.lax.with_sharding_constraint(found, everywhere)
 
 
-def _middle(sensor, point):
-    """Of the places [n, 2] a point was seen from, the one at the median distance."""
+def _median_viewpoint(sensor, point):
+    """The sensor position, of those [n, 2] that measured a point, at the median distance."""
     distance = np.hypot(*(sensor - point).T)
     return sensor[np.argsort(distance, kind="stable")[len(distance) // 2]]
 
 
-def _held(past):
-    """Labels of the landmarks in the map when it was last refined."""
+def _mapped_landmarks(past):
+    """Ids of the landmarks in the map after the last rejuvenation."""
     held = set()
-    for _, kind, label, _ in past.event.tolist():
-        (held.add if kind == FOUND else held.discard)(label)
+    for _, kind, landmark_id, _ in past.event.tolist():
+        (held.add if kind == FOUND else held.discard)(landmark_id)
     return held

@@ -1,8 +1,8 @@
-"""The central camera: pixel <-> unit ray, by two models, and how it sits on the robot.
+"""Central camera models (pixel <-> unit ray), and the pose of the camera on the robot.
 
 Pixels are (u, v): column and row, the centre of the first at (0, 0). The model frame has x along
 columns, y along rows and z along the optical axis, as if the camera were a lens: z > 0 at the
-centre. `Camera.matrix` takes it to the robot's frame (x forward, y left, z up), so that azimuth is
+centre. `Camera.matrix` maps it to the robot's frame (x forward, y left, z up), where azimuth is
 atan2(y, x), counter-clockwise from ahead, and elevation asin(z).
 
 Lengths are normalised by s = half the longer side. `polynomial` is the model of Scaramuzza,
@@ -16,29 +16,30 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 POLYNOMIAL = ("cx", "cy", "c", "d", "e", "p1", "p2", "a0", "a2", "a3", "a4", "a5", "a6")
 UNIFIED = ("cx", "cy", "fx", "fy", "s", "xi", "k1", "k2", "p1", "p2")
 MODELS = ("polynomial", "unified")
-FARTHEST = 1.6  # normalised radius up to which a polynomial is followed: beyond every corner
-NEWTON = 6  # steps; from the table's start four reach double precision
+FARTHEST = 1.6  # normalised radius up to which a polynomial is evaluated: beyond all corners
+NEWTON = 6  # steps; four reach double precision from the table's value
 
 
 def parameter_names(model, count=None):
-    """Names of a model's parameters; `count` of them (None: all): a polynomial may end early."""
+    """Names of the first `count` parameters of a model (None: all); a polynomial may end early."""
     names = {"polynomial": POLYNOMIAL, "unified": UNIFIED}[model]
     return names[:count]
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A calibrated camera, validated when made.
+    """A calibrated camera. Raises `ValueError` for invalid values.
 
-    `params` [P] as `parameter_names(model)` tells, cx, cy, fx, fy, s in px, the rest without unit,
-    `covariance` [P, P] of them or None. `mirror`: seen by one mirror, which turns the sense of z.
-    `lens`: where the lens points on the robot, "up" or "down". `yaw`, `roll`, `pitch` [rad] turn
-    the camera about the robot's z, x and y, in this order; `position` (x, y, height) [m] on the
-    robot. `elevation` (low, high) [rad]: what can be used of the view. Raises `ValueError`.
+    `params` [P], named by `parameter_names(model)`: cx, cy, fx, fy, s in px, others without unit;
+    `covariance` [P, P] of them or None. `mirror`: a single mirror, which reverses z. `lens`: where
+    the lens points on the robot, "up" or "down". `yaw`, `roll`, `pitch` [rad] turn the camera about
+    the robot's z, x and y, in this order; `position` (x, y, height) [m] on the robot. `elevation`
+    (low, high) [rad]: usable part of the view.
     """
 
     width: int
@@ -84,46 +85,46 @@ class Camera:
         if self.model == "polynomial":
             _check_polynomial(self.params)
         elif self["fx"] <= 0 or self["fy"] <= 0 or self["xi"] < 0:
-            raise ValueError("camera: fx and fy must be above 0 and xi not below")
+            raise ValueError("camera: fx and fy must be above 0, and xi at least 0")
 
-    def __getitem__(self, name):
+    def __getitem__(self, name: str) -> float:
         """A parameter by name."""
         return float(self.params[parameter_names(self.model).index(name)])
 
     @property
-    def names(self):
+    def names(self) -> tuple[str, ...]:
         return parameter_names(self.model, len(self.params))
 
     @property
-    def size(self):
+    def size(self) -> tuple[int, int]:
         return self.width, self.height
 
     @property
-    def matrix(self):
-        """[3, 3]: model rays to directions in the robot's frame (improper for a mirror)."""
+    def matrix(self) -> np.ndarray:
+        """Matrix [3, 3] from the model frame to the robot's frame (improper for a mirror)."""
         back = -1.0 if self.mirror else 1.0
         base = np.diag([1.0, 1.0, back]) if self.lens == "up" else np.diag([1.0, -1.0, -back])
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
         return tilt_matrix(self.roll, self.pitch) @ turn @ base
 
-    def ray(self, pixel):
+    def ray(self, pixel: ArrayLike) -> np.ndarray:
         """Unit rays [..., 3] in the model frame of pixels [..., 2]; NaN outside the image."""
         pixel = np.asarray(pixel, float)
         ray = pixel_to_ray(self.model, self.params, self.size, pixel)
         return np.where(self._inside(pixel)[..., None], ray, np.nan)
 
-    def pixel(self, ray):
-        """Pixels [..., 2] of rays [..., 3] of any length in the model frame; NaN if not imaged."""
+    def pixel(self, ray: ArrayLike) -> np.ndarray:
+        """Pixels [..., 2] of rays [..., 3] in the model frame; NaN outside the image."""
         pixel = ray_to_pixel(self.model, self.params, self.size, np.asarray(ray, float))
         return np.where(self._inside(pixel)[..., None], pixel, np.nan)
 
-    def direction(self, pixel):
+    def direction(self, pixel: ArrayLike) -> np.ndarray:
         """Unit directions [..., 3] in the robot's frame of pixels [..., 2]."""
         return self.ray(pixel) @ self.matrix.T
 
-    def project(self, direction):
-        """Pixels [..., 2] of directions [..., 3] in the robot's frame; NaN where not imaged."""
+    def project(self, direction: ArrayLike) -> np.ndarray:
+        """Pixels [..., 2] of directions [..., 3] in the robot's frame; NaN outside the image."""
         return self.pixel(np.asarray(direction, float) @ self.matrix)
 
     def _inside(self, pixel):
@@ -133,7 +134,7 @@ class Camera:
 
 
 def tilt_matrix(roll, pitch):
-    """[3, 3] Ry(pitch) Rx(roll): about the robot's x (forward), then its y (left)."""
+    """Rotation [3, 3] Ry(pitch) Rx(roll): about the robot's x (forward), then its y (left)."""
     c, s = np.cos(roll), np.sin(roll)
     rx = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
     c, s = np.cos(pitch), np.sin(pitch)
@@ -141,7 +142,7 @@ def tilt_matrix(roll, pitch):
 
 
 def pixel_to_ray(model, params, size, pixel):
-    """Unit rays [..., 3] of pixels [..., 2]. NumPy gives NumPy, JAX gives JAX, differentiable."""
+    """Unit rays [..., 3] of pixels [..., 2]; NumPy or JAX arrays, differentiable with JAX."""
     xp, stop = _namespace(params, pixel)
     half = max(size) / 2
     u, v = pixel[..., 0] - params[0], pixel[..., 1] - params[1]
@@ -157,7 +158,7 @@ def pixel_to_ray(model, params, size, pixel):
         y = v / fy
         x, y = _undistort(xp, stop, (u - s * y) / fx, y, params[6:10])
         square = x * x + y * y
-        # Beyond the sphere's rim nothing is imaged: NaN, without a warning or a NaN gradient.
+        # Nothing is imaged beyond the sphere's rim: NaN, without a warning or a NaN gradient.
         inside = 1 + (1 - xi * xi) * square
         root = xp.sqrt(xp.where(inside > 0, inside, 1.0))
         eta = xp.where(inside > 0, (xi + root) / (1 + square), xp.nan)
@@ -167,10 +168,10 @@ def pixel_to_ray(model, params, size, pixel):
 
 
 def ray_to_pixel(model, params, size, ray):
-    """Pixels [..., 2] of rays [..., 3] of any length; NaN beyond what the model images.
+    """Pixels [..., 2] of rays [..., 3] of any length; NaN outside the domain of the model.
 
-    NumPy gives NumPy, JAX gives JAX; the first derivative is exact (one Newton step from the
-    converged root, by the implicit function theorem), higher ones are not.
+    NumPy or JAX arrays. With JAX, first derivatives are exact (one Newton step from the converged
+    root, by the implicit function theorem), higher ones are not.
     """
     xp, stop = _namespace(params, ray)
     half = max(size) / 2
@@ -194,14 +195,14 @@ def ray_to_pixel(model, params, size, ray):
 
 
 def _radius(xp, stop, a, lateral, z):
-    """Root of f(rho) lateral = rho z [...], and whether the polynomial gets that far."""
+    """Root rho [...] of f(rho) lateral = rho z, and whether the polynomial is one to one there."""
     grid = np.linspace(0, FARTHEST, 65)
     angle = xp.arctan2(xp.asarray(grid), _polynomial(stop(a), xp.asarray(grid)))  # from the axis
     rising = xp.concatenate([xp.ones(1, bool), angle[1:] > angle[:-1]])
-    followed = xp.cumprod(rising) > 0  # as far as it is one to one
-    last = xp.max(xp.where(followed, angle, 0.0))
+    one_to_one = xp.cumprod(rising) > 0
+    last = xp.max(xp.where(one_to_one, angle, 0.0))
     wanted = stop(xp.arctan2(lateral, z))
-    rho = xp.interp(wanted, xp.where(followed, angle, last), xp.asarray(grid))
+    rho = xp.interp(wanted, xp.where(one_to_one, angle, last), xp.asarray(grid))
     fixed, side, up = stop(a), stop(lateral), stop(z)
     for _ in range(NEWTON):
         slope = _slope(fixed, rho) * side - up
@@ -213,7 +214,7 @@ def _radius(xp, stop, a, lateral, z):
 
 
 def _polynomial(a, rho):
-    """a0 + a2 rho^2 + a3 rho^3 + ...; there is no linear term: the mirror is smooth at its tip."""
+    """a0 + a2 rho^2 + a3 rho^3 + ..., without a linear term: the mirror is smooth at its tip."""
     total = 0.0 * rho
     for i in range(len(a) - 1, 0, -1):
         total = (total + a[i]) * rho
@@ -221,6 +222,7 @@ def _polynomial(a, rho):
 
 
 def _slope(a, rho):
+    """Derivative of `_polynomial` by rho."""
     total = 0.0 * rho
     for i in range(len(a) - 1, 0, -1):
         total = total * rho + (i + 1) * a[i]
@@ -231,12 +233,12 @@ def _distort(x, y, k):
     """Distorted (x, y) and the Jacobian's entries (xx, xy, yy); k: two radial, two tangential."""
     k1, k2, p1, p2 = k[0], k[1], k[2], k[3]
     square = x * x + y * y
-    radial, landmark_extent = 1 + square * (k1 + k2 * square), 2 * (k1 + 2 * k2 * square)
+    radial, slope = 1 + square * (k1 + k2 * square), 2 * (k1 + 2 * k2 * square)
     out_x = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x)
     out_y = y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y
-    xx = radial + x * x * landmark_extent + 2 * p1 * y + 6 * p2 * x
-    xy = x * y * landmark_extent + 2 * p1 * x + 2 * p2 * y
-    yy = radial + y * y * landmark_extent + 6 * p1 * y + 2 * p2 * x
+    xx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
+    xy = x * y * slope + 2 * p1 * x + 2 * p2 * y
+    yy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
     return out_x, out_y, (xx, xy, yy)
 
 
@@ -257,7 +259,7 @@ def _undistort(xp, stop, x, y, k):
 
 
 def _namespace(*arrays):
-    """NumPy, or jax.numpy as soon as one argument is JAX's; and what stops gradients there."""
+    """NumPy, or jax.numpy if any argument is a JAX array, and its function to stop gradients."""
     if all(isinstance(array, np.ndarray | list | tuple) for array in arrays):
         return np, lambda value: value
     import jax
@@ -277,7 +279,7 @@ def _numbers(name, value, dimensions):
     try:
         array = np.array(value, float)
     except (TypeError, ValueError):
-        raise ValueError(f"camera: {name} is not made of numbers") from None
+        raise ValueError(f"camera: {name} does not consist of numbers") from None
     if array.ndim != dimensions or not np.isfinite(array).all():
         raise ValueError(f"camera: {name} must be finite, with {dimensions} dimensions")
     array.setflags(write=False)

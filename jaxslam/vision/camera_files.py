@@ -1,8 +1,8 @@
-"""Camera files: our own readable TOML, with covariances, and those of other tools.
+"""Camera files: TOML with covariances, and the formats of other tools.
 
 `calib_results.txt` of OCamCalib, camchain YAML of Kalibr (omni + radtan) and YAML of OpenCV
-(camera_matrix, distortion_coefficients, xi of omnidir) know neither covariances nor how the camera
-sits on the robot. Errors are `ValueError` naming file, field and what was found.
+(camera_matrix, distortion_coefficients, xi of omnidir) hold neither covariances nor the pose of the
+camera on the robot. Errors are `ValueError` naming file, field and what was found.
 """
 
 import tomllib
@@ -26,10 +26,10 @@ BY_SUFFIX = {".toml": "toml", ".txt": "ocamcalib", ".yaml": "opencv", ".yml": "o
 ENDINGS = f"a camera file ends in one of {', '.join(BY_SUFFIX)}"
 
 
-def save_camera(path, camera, kind=None):
-    """Write a camera, all or nothing; `kind`: one of `FORMATS`, None: by the name's ending.
+def save_camera(path: str | Path, camera: Camera, kind: str | None = None) -> None:
+    """Write a camera file atomically. `kind`: one of `FORMATS`, None: by the suffix of `path`.
 
-    Raises `ValueError` where it can't be written, or the format has no room for the model.
+    Raises `ValueError` if it can't be written, or if the format can't hold the camera.
     """
     path = Path(path)
     kind = kind or BY_SUFFIX.get(path.suffix.lower())
@@ -44,40 +44,40 @@ def save_camera(path, camera, kind=None):
         file.write(text.encode())
 
 
-def load_camera(path, mirror=False, lens="up"):
-    """`Camera` of a file: .toml, .txt of OCamCalib, .yaml of Kalibr (its cam0) or OpenCV.
+def load_camera(path: str | Path, mirror: bool = False, lens: str = "up") -> Camera:
+    """Read a `Camera`: .toml, .txt of OCamCalib, .yaml of Kalibr (its cam0) or OpenCV.
 
-    `mirror` and `lens` as in `Camera`, for files that don't tell. Raises `ValueError`.
+    `mirror` and `lens` as in `Camera`, for formats that lack them. Raises `ValueError`.
     """
     path = Path(path)
     kind = BY_SUFFIX.get(path.suffix.lower())
     if kind is None:
         raise ValueError(f"{path}: {ENDINGS}")
-    text = _text(path)
+    text = _read_text(path)
     try:
         if kind == "toml":
             return _from_toml(text)
         if kind == "ocamcalib":
-            found = from_ocamcalib(text)
+            model = from_ocamcalib(text)
         else:
-            found = (from_opencv if text.startswith("%YAML") else from_kalibr)(text)
-        return Camera(**found, mirror=mirror, lens=lens)
+            model = (from_opencv if text.startswith("%YAML") else from_kalibr)(text)
+        return Camera(**model, mirror=mirror, lens=lens)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
-def _text(path):
+def _read_text(path):
     try:
         with open(path, "rb") as file:
             content = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise ValueError(f"{path}: can't be read ({error.strerror})") from error
     if len(content) > MAX_BYTES:
-        raise ValueError(f"{path}: over {MAX_BYTES} bytes, so it is no camera file")
+        raise ValueError(f"{path}: over {MAX_BYTES} bytes, so not a camera file")
     try:
         return content.decode("utf-8")
     except UnicodeDecodeError:
-        raise ValueError(f"{path}: is not text, so it is no camera file") from None
+        raise ValueError(f"{path}: is not text, so not a camera file") from None
 
 
 def _to_toml(camera):
@@ -105,7 +105,7 @@ def _from_toml(text):
     known = [field.name for field in fields(Camera)]
     for name in table:
         if name not in known:
-            raise ValueError(f"{name} is no field; there are: {', '.join(known)}")
+            raise ValueError(f"{name} is not a field; the fields are {', '.join(known)}")
     for name in ("width", "height", "model", "params"):
         if name not in table:
             raise ValueError(f"{name} is missing")
@@ -116,16 +116,16 @@ def _from_toml(text):
     names = parameter_names(table["model"], len(table["params"]))
     for part in ("params", "covariance"):
         if part in table:
-            table[part] = _ordered(table[part], part, names)
+            table[part] = _sort_values(table[part], part, names)
     return Camera(**table)
 
 
-def _ordered(values, part, names):
-    """A table's values in the order of `names`, all of which it must have."""
+def _sort_values(values, part, names):
+    """Values of a table in the order of `names`. Raises `ValueError` for missing or other names."""
     if not isinstance(values, dict):
         raise ValueError(f"{part} is {values!r}; must be a table, [{part}]")
     for name in {**dict.fromkeys(names), **values}:
         if name not in values or name not in names:
-            fault = "is missing" if name in names else "is none of the model's params"
+            fault = "is missing" if name in names else "is not a parameter of the model"
             raise ValueError(f"{part}.{name} {fault}")
     return [values[name] for name in names]

@@ -1,8 +1,8 @@
-"""Where a segment of edge pixels stands: column, standard deviation, width; from all its rows.
+"""Localise segments of edge pixels: column, standard deviation and width, from all rows.
 
-The gradients of a segment's rows lie along one line in colour space, its principal axis. The
-profiles across the edge are added up in blocks of rows; every block's parabola has a peak, and its
-curvature is the peak's weight. How the blocks differ tells how good their mean is.
+The gradients of a segment's rows lie along its principal axis in colour space. The profiles across
+the edge are summed in blocks of rows, and a parabola is fitted to each block: its peak is weighted
+by its curvature. The scatter of the blocks' peaks gives the standard deviation of their mean.
 """
 
 from typing import NamedTuple
@@ -11,19 +11,20 @@ import numpy as np
 
 from jaxslam.vision.edges import PAD
 
-REACH = 3  # columns on either side of an edge that its place is found from
-BLOCK = 6  # rows judged together
-PRIOR, USUAL = 3.0, 0.3  # as many blocks' worth of belief in this scatter [columns] of a block
-CLIP = 2.5  # standard deviations beyond which a block counts less
-FADED = 0.5  # of the mean gradient, where a line ends: averaging over rows reaches beyond it
-SOFT = 2.0  # pixels beside an edge where a sharp one's gradient has faded
+REACH = 3  # columns of the profile on either side of an edge
+BLOCK = 6  # rows summed into one profile
+PRIOR, USUAL = 3.0, 0.3  # a prior as strong as 3 blocks that scatter by 0.3 columns
+CLIP = 2.5  # standard deviations beyond which a block's weight falls
+FADED = 0.5  # a line ends at this share of its mean gradient: averaging rows reaches beyond it
+SOFT = 2.0  # pixels from a sharp edge at which its gradient has faded
 
 
 class Fit(NamedTuple):
-    """All [n]: `column` (NaN: no peak), `scatter` its standard deviation, `width` of the edge
-    (standard deviation of its gradient), all in columns of the padded panorama; `slope` [columns
-    per row]; `sign` of the gradient to the right; `strength`, root of the summed squares of the
-    gradient over its `rows`; `sharp`, 1 - gradient nearby / at the edge; `first`, `last` row."""
+    """Of n segments: `column` (NaN: no peak), its standard deviation `scatter`, and `width`
+    (standard deviation of the gradient's profile), in columns of the padded panorama; `slope`
+    [columns per row]; `sign` of the gradient to the right; `strength`, root of the sum of squares
+    of the gradient over the `rows`; `sharp`, 1 - gradient beside / at the edge; `first`, `last`
+    row."""
 
     column: np.ndarray
     scatter: np.ndarray
@@ -38,16 +39,15 @@ class Fit(NamedTuple):
 
 
 def fit_segments(edges, columns_per_pixel):
-    """`Fit` of all segments of `Edges`; `columns_per_pixel` [H]: how wide an image pixel is."""
+    """`Fit` of all segments of `Edges`; `columns_per_pixel` [H]: width of an image pixel."""
     segment, n = edges.segment, int(edges.segment.max(initial=-1)) + 1
     centre = np.rint(mean(edges.column, segment, n)).astype(int)
     centre = np.clip(centre, PAD - 4, edges.along.shape[1] - 1 - (PAD - 4))[segment]
     at = edges.along[edges.row, np.rint(edges.column).astype(int)].astype(float)
     axis = _principal(at, segment, n)[segment]
     along = np.einsum("ec,ec->e", at, axis)
-    axis *= np.sign(along)[
-        :, None
-    ]  # one edge, though what is behind it may change from bright to dark
+    # The background of an edge may change from brighter to darker than its foreground.
+    axis *= np.sign(along)[:, None]
 
     def gradient(of, column):
         return np.einsum("ekc,ec->ek", of[edges.row[:, None], column], axis)
@@ -84,7 +84,7 @@ def mean(value, owner, n):
 
 
 def _ends(edges, clear, n):
-    """First and last row [n] of the segments where `clear` [E]: rows are sorted in segments."""
+    """First and last row [n] of each segment among the `clear` [E] peaks, which are sorted."""
     segment, row, each = edges.segment[clear], edges.row[clear], np.arange(n)
     first, beyond = (np.searchsorted(segment, each, side) for side in ("left", "right"))
     return row[first], row[beyond - 1]
@@ -98,7 +98,7 @@ def _slope(edges, n):
 
 
 def _principal(vectors, owner, n):
-    """Unit principal axis [n, C] of vectors [E, C] by owner, towards brighter."""
+    """Unit principal axis [n, C] of vectors [E, C] by owner, pointing to brighter colours."""
     products = [np.bincount(owner, a * b, n) for a in vectors.T for b in vectors.T]
     moment = np.stack(products, -1).reshape(n, vectors.shape[1], vectors.shape[1])
     axis = np.linalg.eigh(moment)[1][:, :, -1]
@@ -106,30 +106,31 @@ def _principal(vectors, owner, n):
 
 
 def _peak(profile, owner, n):
-    """Column of the peak from the middle one, its standard deviation, its width [n]; robust.
+    """Robust offset [n] of the peak from the middle column, its standard deviation and width.
 
-    `profile` [blocks, 2 REACH + 1] of blocks that belong to segment `owner` [blocks].
+    `profile` [blocks, 2 REACH + 1] of the blocks of segment `owner` [blocks].
     """
-    whole = np.stack([np.bincount(owner, part, n) for part in profile.T], -1)
-    top = 1 + np.argmax(whole[:, 1:-1], axis=1)
+    summed = np.stack([np.bincount(owner, part, n) for part in profile.T], -1)
+    top = 1 + np.argmax(summed[:, 1:-1], axis=1)
     left, middle, right = (profile[np.arange(len(owner)), top[owner] + k] for k in (-1, 0, 1))
-    base = np.clip(2 * middle - left - right, 0, None)
-    place = np.clip((right - left) / 2 / np.maximum(base, 1e-6), -1.5, 1.5)
-    average = np.maximum(mean(base, owner, n), 1e-9)
-    share = base / average[owner]
+    curvature = np.clip(2 * middle - left - right, 0, None)
+    peak = np.clip((right - left) / 2 / np.maximum(curvature, 1e-6), -1.5, 1.5)
+    average = np.maximum(mean(curvature, owner, n), 1e-9)
+    share = curvature / average[owner]
     weight = share
     for _ in range(3):
         total = np.maximum(np.bincount(owner, weight, n), 1e-9)
-        offset = np.bincount(owner, weight * place, n) / total
-        away = np.abs(place - offset[owner])
-        square = np.bincount(owner, weight * away**2, n) + PRIOR * USUAL**2
+        offset = np.bincount(owner, weight * peak, n) / total
+        deviation = np.abs(peak - offset[owner])
+        square = np.bincount(owner, weight * deviation**2, n) + PRIOR * USUAL**2
         variance = square / (np.maximum(np.bincount(owner, minlength=n) - 1, 0) + PRIOR)
-        ratio = away * np.sqrt(share / variance[owner])
+        ratio = deviation * np.sqrt(share / variance[owner])
         weight = share * CLIP / np.maximum(ratio, CLIP)
-    found = (
-        whole[np.arange(n), top] * 2 > whole[np.arange(n), top - 1] + whole[np.arange(n), top + 1]
+    is_peak = (
+        summed[np.arange(n), top] * 2
+        > summed[np.arange(n), top - 1] + summed[np.arange(n), top + 1]
     )
-    left, middle, right = (np.maximum(whole[np.arange(n), top + k], 1e-9) for k in (-1, 0, 1))
-    curved = np.maximum(2 * np.log(middle) - np.log(left) - np.log(right), 0.05)
-    column = np.where(found, top - REACH + offset, np.nan)
-    return column, np.sqrt(variance / total), np.sqrt(1 / curved)
+    left, middle, right = (np.maximum(summed[np.arange(n), top + k], 1e-9) for k in (-1, 0, 1))
+    log_curvature = np.maximum(2 * np.log(middle) - np.log(left) - np.log(right), 0.05)
+    column = np.where(is_peak, top - REACH + offset, np.nan)
+    return column, np.sqrt(variance / total), np.sqrt(1 / log_curvature)

@@ -1,10 +1,11 @@
 """From images and odometry to a log: lines of every image, matched and triangulated.
 
-Images are read one at a time; only their lines are kept. What is done is on the disk as well, so
-that a run that was interrupted goes on where it stopped and ends with the same log.
+Images are read one at a time; only their lines are kept. A journal on disk holds the lines found so
+far, so that an interrupted run resumes where it stopped and ends with the same log.
 """
 
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -15,15 +16,17 @@ from jaxslam.logs.log_file import save_log
 from jaxslam.logs.odometry import increments
 from jaxslam.logs.readers.csv_files import read_odometry, read_truth
 from jaxslam.logs.readers.text_table import drop_bad_rows, parse, pose_at, read_lines
-from jaxslam.vision.extraction_journal import Partial
+from jaxslam.parameters import Params
+from jaxslam.vision.camera import Camera
+from jaxslam.vision.extraction_journal import ExtractionJournal
 from jaxslam.vision.image_times import NO_TIME, image_times
 from jaxslam.vision.images import Images, cv2
 from jaxslam.vision.lines import Lines, LineSettings, extract_lines, is_dark
-from jaxslam.vision.log_triangulation import triangulate_log
+from jaxslam.vision.log_triangulation import PointSettings, triangulate_log
 from jaxslam.vision.overlay import draw_on_image
 
-DETECTION = 0.5  # declared: what stands in a room hides what is behind it, half of the time
-REACH = 10.0  # m, declared as what the camera can see
+DETECTION = 0.5  # declared in the log: about half of the time, a line is hidden by furniture
+REACH = 10.0  # m, declared in the log as the camera's range
 PLAN = ["x1_m", "y1_m", "x2_m", "y2_m"]
 MOTION = ("err_tran", "err_rot", "err_drift", "floor_tran", "floor_rot", "gain_tran", "gain_rot")
 MOTION += ("bias_drift",)
@@ -32,60 +35,63 @@ CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
 
 
 def extract(
-    source,  # folder, file, pattern, list of files or video: see `Images`
-    camera,  # `Camera`
-    odometry,  # .csv of velocities or commands: see `readers.csvpair`
-    out=None,  # .npz to write; None: only the `Log` is returned, and nothing can be resumed
+    source: str | Path | Sequence[str | Path],  # as for `Images`
+    camera: Camera,
+    odometry: str | Path,  # .csv, velocities or commands: see `csv_files.read_odometry`
+    out: str | Path | None = None,  # .npz to write; None: cannot be resumed
     *,
-    times=None,  # .csv image,time_s; None: see `image_times`
-    truth=None,  # folder of poses.csv, landmarks.csv and plan.csv, those that are known
-    lines=None,  # `LineSettings`
-    points=None,  # `PointSettings`
-    params=None,  # `Params` of the robot's motion, for the points and declared; None: the defaults
-    reach=REACH,  # m
-    overlay=None,  # folder for pictures, or an .mp4 or .avi, with the lines drawn in
-    overwrite=False,  # replace `out`
-    progress=None,  # called with (images done, images in all)
-):
-    """`Log` of a drive's images. Rows are lines: bearing, its sigma, a descriptor of 9 columns
-    (elevations of the ends, polarity, colours left and right as blue, green, red), and a point
-    where the line was seen from far enough apart.
+    times: str | Path | None = None,  # .csv image,time_s; None: see `image_times`
+    truth: str | Path | None = None,  # folder with any of poses.csv, landmarks.csv and plan.csv
+    lines: LineSettings | None = None,
+    points: PointSettings | None = None,
+    params: Params | None = None,  # of the motion, declared in the log
+    reach: float = REACH,  # m, range of the camera
+    overlay: str | Path | None = None,  # folder or video to write, images with their lines
+    overwrite: bool = False,  # replace `out`
+    progress: Callable[[int, int], None] | None = None,  # images done, number of images
+) -> Log:
+    """Make a `Log` from the images of a drive. A measurement is a line: its bearing [rad] in the
+    robot's frame, `bearing_sigma`, a descriptor of 9 columns (elevations of the ends, polarity,
+    colours left and right as blue, green, red), and a point [m] where its parallax suffices.
 
-    Every image that could be looked at is a frame, also when it showed no line. The lines' own
-    standard deviations go to `bearing_sigma`; the parameter `sigma_bearing`, which the filter
-    believes, is left alone: what a filter can bear is wider than what a line's fit says, since
-    errors of edges with a size repeat. Images and rows left out are counted by reason in `skipped`.
-    Raises `ValueError` when there is nothing to work on, or settings changed since a run that was
-    interrupted.
+    Every readable image is a frame, even without a line. `bearing_sigma` is the standard deviation
+    of a line's fit. The filter's `sigma_bearing` stays as it is: it has to be larger, since errors
+    of edges that have a width repeat from frame to frame. Images and measurements left out are
+    counted by reason in `skipped`. Raises `ValueError` if no image can be used, or if the settings
+    differ from those of the interrupted run to be resumed.
     """
     _check_out(out, overwrite)
-    partial = None if out is None else Path(out).with_name(f".{Path(out).name}.partial")
+    journal_path = None if out is None else Path(out).with_name(f".{Path(out).name}.partial")
     skipped = {}
     lines = LineSettings() if lines is None else lines
     images = Images(source)
-    _check_overlay(overlay, images, overwrite or (partial is not None and partial.exists()))
+    resumes = journal_path is not None and journal_path.exists()
+    _check_overlay(overlay, images, overwrite or resumes)
     kind, table = read_odometry(odometry, skipped)
     time, origin = image_times(images, (kind, table.time), times)
-    kept = _in_time(images, time, kind, table.time, skipped)
+    kept = _select_images(images, time, kind, table.time, skipped)
     if len(kept) == 0:
-        between = f"{origin}, {_span(time[time != NO_TIME])}; {odometry} has {_span(table.time)}"
-        raise ValueError(f"{images.names[0]}: no image has odometry; times are from {between}")
-    known = _read_known(truth, skipped)
-    settings = _settings(images, time, kept, camera, lines)
-    with Partial(partial, settings) as done:
-        _look(images, kept, camera, lines, done, overlay, progress)
-    if all(isinstance(found, str) for _, found in done.rows):
-        done.remove()  # nothing in it is worth going on from
-    log = _log(done.rows, time[kept], kind, table, camera, reach, skipped, _name(source, out))
-    log = _with_truth(log, *known)
-    if params is not None:  # the filter must believe of the motion what the points were made with
+        spans = f"{_format_span(time[time != NO_TIME])}; {odometry} has {_format_span(table.time)}"
+        raise ValueError(
+            f"{images.names[0]}: no image has odometry; times are from {origin}, {spans}"
+        )
+    known = _read_truth_folder(truth, skipped)
+    settings = _fingerprint(images, time, kept, camera, lines)
+    with ExtractionJournal(journal_path, settings) as journal:
+        _extract_images(images, kept, camera, lines, journal, overlay, progress)
+    if all(isinstance(lines, str) for _, lines in journal.images):
+        journal.remove()  # there is nothing in it to resume from
+    name = _log_name(source, out)
+    log = _make_log(journal.images, time[kept], kind, table, camera, reach, skipped, name)
+    log = _add_truth(log, *known)
+    if params is not None:  # the filter must use the motion model that the points were made with
         noise = {name: float(getattr(params, name)) for name in MOTION}
         log = replace(log, noise=log.noise | noise)
         params = params._replace(mount_x=log.mounting[0], mount_y=log.mounting[1], mount_yaw=0.0)
     log = triangulate_log(log, params, points)
     if out is not None:
         save_log(out, log)
-        done.remove()
+        journal.remove()
     return log
 
 
@@ -100,31 +106,33 @@ def _check_out(out, overwrite):
 
 
 def _check_overlay(target, images, replace):
-    """Refuse what would replace the images themselves, or drawings of another run."""
+    """Raise `ValueError` if drawings would replace the images, or the drawings of another run."""
     if target is None:
         return
     target = Path(target)
-    theirs = [images.video] if images.video else {Path(file).parent for file in images.files}
-    if any(target.resolve() == place.resolve() for place in theirs):
-        raise ValueError(f"{target}: the images themselves are there; choose another for drawings")
-    taken = any(target.iterdir()) if target.is_dir() else target.exists()
-    if taken and not replace:
+    sources = [images.video] if images.video else {Path(file).parent for file in images.files}
+    if any(target.resolve() == source.resolve() for source in sources):
+        raise ValueError(
+            f"{target}: the images themselves are there; choose another place for drawings"
+        )
+    exists = any(target.iterdir()) if target.is_dir() else target.exists()
+    if exists and not replace:
         raise ValueError(f"{target}: exists; choose another name or add --overwrite")
 
 
-def _span(stamps):
+def _format_span(stamps):
     return f"{stamps.min() / 1e9:.1f} to {stamps.max() / 1e9:.1f} s"
 
 
-def _name(source, out):
+def _log_name(source, out):
     if out is not None:
         return Path(out).stem
     first = source[0] if isinstance(source, list | tuple) else source
     return Path(first).stem or "images"
 
 
-def _in_time(images, time, kind, odometry_time, skipped):
-    """Indices of the images to look at, in order of time."""
+def _select_images(images, time, kind, odometry_time, skipped):
+    """Indices of the images to process, in order of time."""
     timed = np.flatnonzero(time != NO_TIME)
     _count(skipped, "image without a time", len(time) - len(timed))
     backwards = int((np.diff(time[timed]) < 0).sum())
@@ -132,18 +140,18 @@ def _in_time(images, time, kind, odometry_time, skipped):
         raise ValueError(f"{images.video}: times run backwards; a video can't be sorted")
     _count(skipped, "image out of order (sorted, none lost)", backwards)
     order = timed[np.argsort(time[timed], kind="stable")]
-    again = np.diff(time[order], prepend=time[order][:1] - 1) == 0
-    _count(skipped, "image with the stamp of another (first kept)", int(again.sum()))
-    order = order[~again]
+    repeated = np.diff(time[order], prepend=time[order][:1] - 1) == 0
+    _count(skipped, "image with the stamp of another (first kept)", int(repeated.sum()))
+    order = order[~repeated]
     if kind == "velocity":
-        # Beyond its ends the robot is taken to stand, which a moving one does not.
+        # Before and after its odometry the robot is assumed to stand, which may be wrong.
         period = np.median(np.diff(odometry_time)) if len(odometry_time) > 1 else 0
         margin = max(2 * period, 10**8)
         inside = time[order] >= odometry_time[0] - margin
         inside &= time[order] <= odometry_time[-1] + margin
     else:
-        # A command acts at its stamp: what comes before the first or after the last stands still,
-        # but an image a long way off belongs to another drive.
+        # A command acts at its stamp: before the first and after the last one the robot stands.
+        # An image from long before or after belongs to another drive.
         margin = max(60e9, float(odometry_time[-1] - odometry_time[0]))
         inside = np.abs(time[order] - np.clip(time[order], *odometry_time[[0, -1]])) <= margin
     _count(skipped, "image without odometry at its time", int((~inside).sum()))
@@ -155,99 +163,99 @@ def _count(skipped, reason, count):
         skipped[reason] = skipped.get(reason, 0) + int(count)
 
 
-def _settings(images, time, kept, camera, lines):
-    """What the lines depend on, for a run that goes on later."""
+def _fingerprint(images, time, kept, camera, lines):
+    """What the lines depend on, compared before a run is resumed."""
     names = [images.names[i] for i in kept]
     files = [images.video] if images.video else [images.files[i] for i in kept]
     sizes = [Path(file).stat().st_size if Path(file).exists() else -1 for file in files]
-    seen = {name: np.asarray(value).tolist() for name, value in asdict(camera).items()
-            if value is not None and name != "covariance"}  # fmt: skip
+    model = {name: np.asarray(value).tolist() for name, value in asdict(camera).items()
+             if value is not None and name != "covariance"}  # fmt: skip
     return {
         "images": list(zip(names, time[kept].tolist(), strict=True)),
         "sizes of the images": sizes,
-        "camera": seen,
+        "camera": model,
         "lines": asdict(lines),
     }
 
 
-def _look(images, kept, camera, settings, done, overlay, progress):
-    """Lines of all images that are not done yet, appended to `done`, and drawn if wanted."""
-    total, ready = len(kept), len(done.rows)
+def _extract_images(images, kept, camera, settings, journal, overlay, progress):
+    """Append the lines of all images that are not in `journal` yet; draw them if wanted."""
+    total, done = len(kept), len(journal.images)
     with _Overlay(overlay) as canvas:
-        # What is done is looked at again only if it is to be drawn again.
-        first = 0 if overlay is not None else ready
+        # Finished images are read again only to be drawn.
+        first = 0 if overlay is not None else done
         for k, (name, image) in enumerate(_stream(images, kept, first), first):
-            if k >= ready:
-                done.add(name, _lines_of(image, camera, settings))
-            if overlay is not None and not isinstance(done.rows[k][1], str):
-                canvas.add(name, draw_on_image(image, done.rows[k][1], camera))
+            if k >= done:
+                journal.add(name, _extract_image(image, camera, settings))
+            lines = journal.images[k][1]
+            if overlay is not None and not isinstance(lines, str):
+                canvas.add(name, draw_on_image(image, lines, camera))
             if progress:
                 progress(k + 1, total)
 
 
 def _stream(images, kept, first):
-    """(name, image or `ValueError`) of the images `kept`, in that order, from the first on."""
+    """Yield (name, image or `ValueError`) of the images `kept` from index `first` on, in order."""
     if not images.video:
         yield from Images([images.files[i] for i in kept]).stream(first)
         return
-    wanted, given = set(kept[first:].tolist()), set()
-    for i, found in enumerate(images.stream()):
+    wanted, read = set(kept[first:].tolist()), set()
+    for i, frame in enumerate(images.stream()):
         if i in wanted:
-            given.add(i)
-            yield found
-    for i in sorted(wanted - given):  # the header promised more than there is
-        yield images.names[i], ValueError(f"{images.names[i]}: the video ends before")
+            read.add(i)
+            yield frame
+    for i in sorted(wanted - read):  # the header announced more frames than there are
+        yield images.names[i], ValueError(f"{images.names[i]}: the video ends before this frame")
 
 
-def _lines_of(image, camera, settings):
-    """`Lines`, or the reason why there are none."""
+def _extract_image(image, camera, settings):
+    """`Lines` of an image, or the reason why there are none."""
     if isinstance(image, ValueError):
         return f"image unreadable: {str(image).split(': ', 1)[-1]}"
     if image.shape[:2] != (camera.height, camera.width):
-        found = f"{image.shape[1]} x {image.shape[0]}"
-        return f"image of {found} pixels, camera of {camera.width} x {camera.height}"
+        size = f"{image.shape[1]} x {image.shape[0]}"
+        return f"image of {size} pixels, camera of {camera.width} x {camera.height}"
     if is_dark(image):
         return "dark image"
     return extract_lines(image, camera, settings)
 
 
-def _log(rows, time, kind, odometry, camera, reach, skipped, name):
-    """The `Log` of bearings alone."""
-    reasons = Counter(found for _, found in rows if isinstance(found, str))
+def _make_log(images, time, kind, odometry, camera, reach, skipped, name):
+    """The `Log` of bearings alone, without truth or points."""
+    reasons = Counter(lines for _, lines in images if isinstance(lines, str))
     first = {}
-    for image, found in rows:
-        if isinstance(found, str):
-            first.setdefault(found, image)
+    for image, lines in images:
+        if isinstance(lines, str):
+            first.setdefault(lines, image)
     skipped |= {f"{why} (first: {first[why]})": count for why, count in reasons.items()}
-    looked = [k for k, (_, found) in enumerate(rows) if not isinstance(found, str)]
-    if not looked:
+    usable = [k for k, (_, lines) in enumerate(images) if not isinstance(lines, str)]
+    if not usable:
         why, count = reasons.most_common(1)[0]
-        raise ValueError(f"{first[why]}: no image can be used; {count} of {len(rows)}: {why}")
-    found = [rows[k][1] for k in looked]
-    counts = [len(lines.bearing) for lines in found]
+        raise ValueError(f"{first[why]}: no image can be used; {count} of {len(images)}: {why}")
+    frames = [images[k][1] for k in usable]
+    counts = [len(lines.bearing) for lines in frames]
     _count(skipped, f"{NOT_USED}image without a line (a frame all the same)", counts.count(0))
-    lines = Lines(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    lines = Lines(*(np.concatenate(parts) for parts in zip(*frames, strict=True)))
     colour = lines.colour.reshape(-1, 6)
-    log = Log(
+    return Log(
         name=name,
         odometry_time=odometry.time,
         odometry=odometry.value,
         odometry_kind=kind,
-        frame_time=time[looked],
-        frame=np.repeat(np.arange(len(looked)), counts),
+        frame_time=time[usable],
+        frame=np.repeat(np.arange(len(usable)), counts),
         bearing=lines.bearing,
         bearing_sigma=lines.sigma,
         descriptor=np.column_stack([lines.low, lines.high, lines.polarity, colour]),
         view=(-np.pi, np.pi, reach),
-        mounting=(*camera.position[:2], 0.0),  # bearings are in the robot's heading already
+        mounting=(*camera.position[:2], 0.0),  # bearings are relative to the robot's heading
         noise={"detection": DETECTION},
         skipped=skipped,
     )
-    return log
 
 
-def _read_known(folder, skipped):
-    """`Truth` and `FloorPlan` in a folder, None where it has none; counts bad rows in `skipped`."""
+def _read_truth_folder(folder, skipped):
+    """`Truth` and `FloorPlan` of a folder, or None; bad rows are counted in `skipped`."""
     if folder is None:
         return None, None
     folder = Path(folder)
@@ -259,8 +267,8 @@ def _read_known(folder, skipped):
     return truth, plan
 
 
-def _with_truth(log, truth, plan):
-    """The log with what is known of the truth, and the start pose of it."""
+def _add_truth(log, truth, plan):
+    """The log with its truth, started at the true pose if that is known."""
     motion = increments(log)
     still = (motion.distance[1:] == 0) & (motion.turn[1:] == 0)
     skipped = dict(log.skipped)
@@ -284,7 +292,7 @@ def read_plan(path):
 
 
 class _Overlay:
-    """Pictures into a folder, or frames into a video, by the name's ending."""
+    """Writer of drawings: pictures in a folder, or frames of a video, by the suffix of `target`."""
 
     def __init__(self, target):
         self.target = None if target is None else Path(target)
@@ -296,7 +304,7 @@ class _Overlay:
                 self.target.mkdir(parents=True, exist_ok=True)
             except OSError as err:
                 raise ValueError(
-                    f"{self.target}: cannot be made ({err.strerror}); give a folder, .mp4 or .avi"
+                    f"{self.target}: can't be made ({err.strerror}); give a folder, .mp4 or .avi"
                 ) from None
         return self
 

@@ -1,7 +1,7 @@
-"""What a long extraction has done so far, kept beside its output so that it can go on.
+"""Journal of a long extraction, kept beside its output so that an interrupted run can resume.
 
-One line of JSON per image, appended and forced to the disk now and then; the first line says what
-settings it was made with. A line cut off by a crash is dropped.
+One line of JSON per image, appended, and synchronized to disk about once a second; the first line
+holds the settings. A line cut off by a crash is dropped.
 """
 
 import base64
@@ -14,95 +14,97 @@ import numpy as np
 
 from jaxslam.vision.lines import Lines
 
-EVERY_S = 1.0  # s between forced writes: that much work is lost at most
+EVERY_S = 1.0  # s between calls of fsync: at most that much work is lost
 
 
-class Partial:
-    """Images done, in order: `rows`, each (name, `Lines` or the reason why there are none).
+class ExtractionJournal:
+    """The finished images in order: `images`, each (name, `Lines` or the reason for having none).
 
-    `settings`: what the result depends on, as JSON can write it. Use it in a `with`; `path` None
-    keeps everything in memory only. Raises `ValueError` when the file there was made with others.
+    `settings`: what the result depends on, as JSON values. A context manager; with `path` None
+    everything stays in memory. Raises `ValueError` if an existing file has other settings.
     """
 
     def __init__(self, path, settings):
         self.path = None if path is None else Path(path)
         self.settings = json.loads(json.dumps(settings))
-        self.rows, self.file, self.forced = [], None, time.monotonic()
+        self.images, self.file, self.synced = [], None, time.monotonic()
 
     def __enter__(self):
         if self.path is None:
             return self
         try:
-            kept = self._read() if self.path.exists() else 0
+            size = self._read() if self.path.exists() else 0
             self.file = open(self.path, "ab")
-            self.file.truncate(kept)
+            self.file.truncate(size)
         except OSError as err:
             raise ValueError(f"{self.path}: cannot write ({err.strerror})") from err
-        if not kept:
+        if not size:
             self._append(self.settings)
-            self._force()
+            self._sync()
         return self
 
     def __exit__(self, *_):
         if self.file is not None:
-            self._force()
+            self._sync()
             self.file.close()
 
     def _read(self):
-        """Fill `rows`; the number of good bytes."""
+        """Read `images` from the file; returns the number of intact bytes."""
         data = self.path.read_bytes()
         lines = data[: data.rfind(b"\n") + 1].splitlines(keepends=True)
         if not lines:
             return 0
         try:
             settings = json.loads(lines[0])
-            rows = [_decoded(json.loads(line)) for line in lines[1:]]
+            images = [_decode(json.loads(line)) for line in lines[1:]]
         except (ValueError, KeyError, TypeError) as err:
-            raise ValueError(f"{self.path}: is damaged ({err}); delete it to begin anew") from None
+            raise ValueError(
+                f"{self.path}: is damaged ({err}); delete it to start afresh"
+            ) from None
         if settings != self.settings:
             both = set(settings) | set(self.settings)
             changed = sorted(k for k in both if settings.get(k) != self.settings.get(k))
             raise ValueError(
-                f"{self.path}: was begun with other settings ({', '.join(changed)}); use those "
-                "again, or delete it to begin anew"
+                f"{self.path}: was started with other settings ({', '.join(changed)}); use those "
+                "again, or delete it to start afresh"
             )
-        self.rows = rows
+        self.images = images
         return sum(map(len, lines))
 
-    def add(self, name, found):
+    def add(self, name, lines):
         """Append an image's `Lines`, or the reason why there are none."""
-        self.rows.append((name, found))
+        self.images.append((name, lines))
         if self.file is not None:
-            self._append(_encoded(name, found))
-            if time.monotonic() - self.forced > EVERY_S:
-                self._force()
+            self._append(_encode(name, lines))
+            if time.monotonic() - self.synced > EVERY_S:
+                self._sync()
 
     def remove(self):
-        """Delete the file: the result is in a safe place."""
+        """Delete the file, once the result is stored elsewhere."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
 
     def _append(self, value):
         self.file.write(json.dumps(value).encode() + b"\n")
 
-    def _force(self):
+    def _sync(self):
         self.file.flush()
         os.fsync(self.file.fileno())
-        self.forced = time.monotonic()
+        self.synced = time.monotonic()
 
 
-def _encoded(name, found):
-    if isinstance(found, str):
-        return {"image": name, "skipped": found}
+def _encode(name, lines):
+    if isinstance(lines, str):
+        return {"image": name, "skipped": lines}
     parts = {}
-    for field, array in zip(Lines._fields, found, strict=True):
+    for field, array in zip(Lines._fields, lines, strict=True):
         array = np.ascontiguousarray(array)
         data = base64.b64encode(array.tobytes()).decode()
         parts[field] = [array.dtype.str, list(array.shape), data]
     return {"image": name, "lines": parts}
 
 
-def _decoded(row):
+def _decode(row):
     if "skipped" in row:
         return row["image"], row["skipped"]
     arrays = {}

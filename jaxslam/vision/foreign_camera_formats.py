@@ -1,4 +1,4 @@
-"""The camera formats of OCamCalib, Kalibr and OpenCV: text <-> fields of a `Camera`.
+"""Camera formats of OCamCalib, Kalibr and OpenCV: text <-> fields of a `Camera`.
 
 OCamCalib's axes are (row, column) and its z points away from the scene, so a = -a_ocam; its
 polynomial is in px, lowest power first, as is the inverse one, which takes atan(z / r) to r.
@@ -22,7 +22,7 @@ OCAM = (
     'image size: "height" and "width"',
 )
 OCAM_NAMES = ("direct polynomial", "inverse polynomial", "center", "affine", "image size")
-INVERSE_ERROR, INVERSE_DEGREE = 0.01, 25  # px at most, by a degree of at most
+INVERSE_ERROR, INVERSE_DEGREE = 0.01, 25  # largest error [px] and degree
 
 
 def from_ocamcalib(text):
@@ -34,7 +34,7 @@ def from_ocamcalib(text):
     values = [_floats(name, line) for name, line in zip(OCAM_NAMES, lines, strict=False)]
     for name, value in zip(OCAM_NAMES[:2], values, strict=False):
         if len(value) < 2 or value[0] != len(value) - 1:
-            raise ValueError(f"{name} says {value[0]:g} coefficients but has {len(value) - 1}")
+            raise ValueError(f"{name} announces {value[0]:g} coefficients but has {len(value) - 1}")
     for name, value, count in zip(OCAM_NAMES[2:], values[2:], (2, 3, 2), strict=False):
         if len(value) != count:
             raise ValueError(f"{name} has {len(value)} numbers; must be {count}")
@@ -42,7 +42,7 @@ def from_ocamcalib(text):
     direct = values[0][1:]
     if len(direct) > 7 or direct[1:2].any():
         raise ValueError("direct polynomial: must be of order 6 at most, without a linear term")
-    width, height = _whole("image size", width), _whole("image size", height)
+    width, height = _positive_integer("image size", width), _positive_integer("image size", height)
     powers = np.arange(max(len(direct), 3))
     a = -np.pad(direct, (0, len(powers) - len(direct))) * (max(width, height) / 2) ** (powers - 1.0)
     params = [column, row, c, d, e, 0, 0, a[0], *a[2:]]
@@ -50,7 +50,7 @@ def from_ocamcalib(text):
 
 
 def to_ocamcalib(camera):
-    """Text of a calib_results.txt. Raises `ValueError` if it can't hold the camera."""
+    """Text of a calib_results.txt. Raises `ValueError` if the format can't hold the camera."""
     if camera.model != "polynomial" or camera["p1"] or camera["p2"]:
         raise ValueError(
             "OCamCalib's file holds a polynomial camera without decentring (p1, p2) only;"
@@ -69,13 +69,14 @@ def to_ocamcalib(camera):
         [camera.height, camera.width],
     )
     lines = [
-        f"#{title}\n\n{_written(values)}\n" for title, values in zip(OCAM, numbers, strict=True)
+        f"#{title}\n\n{_format_numbers(values)}\n"
+        for title, values in zip(OCAM, numbers, strict=True)
     ]
     return "\n".join(lines)
 
 
 def _inverse(direct, farthest):
-    """Coefficients, lowest power first, of r [px] over atan(z / r), as far as it is one to one."""
+    """Fit r [px] by powers of atan(z / r), lowest first, as far as it is one to one."""
     r = np.linspace(farthest / 2000, farthest, 2000)
     angle = np.arctan(np.polynomial.polynomial.polyval(r, direct) / r)
     falling = np.flatnonzero(np.diff(angle) <= 0)
@@ -87,7 +88,7 @@ def _inverse(direct, farthest):
     return fit.convert().coef
 
 
-def _written(values):
+def _format_numbers(values):
     return " ".join(str(v) if isinstance(v, int) else f"{v:.16e}" for v in values)
 
 
@@ -99,7 +100,7 @@ def from_kalibr(text):
         raise ValueError(f"is not YAML ({str(error).splitlines()[0]})") from None
     camera = chain.get("cam0") if isinstance(chain, dict) else None
     if not isinstance(camera, dict):
-        raise ValueError("has no cam0, so it is no camchain of Kalibr")
+        raise ValueError("has no cam0, so it is not a camchain of Kalibr")
     for name, allowed in (("camera_model", "omni"), ("distortion_model", "radtan")):
         if camera.get(name) != allowed:
             raise ValueError(f"cam0.{name} is {camera.get(name)!r}; must be {allowed}")
@@ -110,13 +111,13 @@ def from_kalibr(text):
             raise ValueError(f"cam0.{name} is {values!r}; must be {count} numbers")
         found.append(_floats(f"cam0.{name}", values))
     (xi, fx, fy, cx, cy), distortion, size = found
-    width, height = (_whole("cam0.resolution", n) for n in size)
+    width, height = (_positive_integer("cam0.resolution", n) for n in size)
     params = [cx, cy, fx, fy, 0, xi, *distortion]
     return dict(width=width, height=height, model="unified", params=params)
 
 
 def to_kalibr(camera):
-    """Text of a camchain. Raises `ValueError` if it can't hold the camera."""
+    """Text of a camchain. Raises `ValueError` if the format can't hold the camera."""
     if camera.model != "unified" or camera["s"]:
         raise ValueError(
             "Kalibr's omni holds a unified camera without skew (s) only; calibrate with simple=True"
@@ -136,7 +137,7 @@ def to_kalibr(camera):
 
 
 def from_opencv(text):
-    """Fields of a `Camera` from camera_matrix, distortion_coefficients, xi, as of cv2.omnidir."""
+    """Fields of a `Camera` from camera_matrix, distortion_coefficients and xi of cv2.omnidir."""
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         found = {}
@@ -156,13 +157,15 @@ def from_opencv(text):
     fx, s, cx, _, fy, cy = found["camera_matrix"][:6]
     if not np.array_equal(found["camera_matrix"][[3, 6, 7, 8]], [0, 0, 0, 1]):
         raise ValueError("camera_matrix must be [fx, s, cx; 0, fy, cy; 0, 0, 1]")
-    width, height = (_whole(name, found[name][0]) for name in ("image_width", "image_height"))
+    width, height = (
+        _positive_integer(name, found[name][0]) for name in ("image_width", "image_height")
+    )
     params = [cx, cy, fx, fy, s, found["xi"][0], *found["distortion_coefficients"]]
     return dict(width=width, height=height, model="unified", params=params)
 
 
 def to_opencv(camera):
-    """Text that cv2.FileStorage reads. Raises `ValueError` if it can't hold the camera."""
+    """Text for cv2.FileStorage. Raises `ValueError` if the format can't hold the camera."""
     if camera.model != "unified":
         raise ValueError("OpenCV's file holds a unified camera only; calibrate with that model")
     fx, fy, s, cx, cy = (camera[name] for name in ("fx", "fy", "s", "cx", "cy"))
@@ -185,7 +188,7 @@ def _floats(name, values):
     return numbers
 
 
-def _whole(name, value):
+def _positive_integer(name, value):
     if value != int(value) or value < 1:
         raise ValueError(f"{name} is {value:g}; must be a whole number above 0")
     return int(value)

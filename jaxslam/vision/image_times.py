@@ -1,4 +1,4 @@
-"""When each image was taken, in the odometry's clock: from a table, names, a video, or commands."""
+"""Times of images in the odometry's clock: from a table, commands, a video or the images' names."""
 
 from pathlib import Path
 
@@ -12,23 +12,23 @@ NO_TIME = -(1 << 62)
 
 
 def image_times(images, odometry, table=None):
-    """Stamps int64 [n] ns of `Images`, `NO_TIME` where one has none, and where they are from.
+    """Stamps int64 [n] ns of `Images` (`NO_TIME`: unknown), and their origin in words.
 
-    The first that applies: `table`, or a `frames.csv` (image,time_s) in the images' folder or the
-    one above; commands, if there is one image more than commands: one before the first and one
-    after each; a video's own times; names that are plain numbers, in seconds. `odometry` is (kind,
-    stamps [o] ns). Raises `ValueError` that says what to provide.
+    The first source that applies: `table`, or a `frames.csv` (image,time_s) in the images' folder
+    or the one above; commands, if there is one image before the first and one after each; a video's
+    frame rate; names that are numbers, in seconds. `odometry` is (kind, stamps [o] ns). Raises
+    `ValueError` saying what to provide.
     """
-    table = _beside(images) if table is None else Path(table)
+    table = _find_table(images) if table is None else Path(table)
     if table is not None:
         return _from_table(images, table), str(table)
     kind, stamps = odometry
     if kind == "command" and len(images) == len(stamps) + 1:
-        # Only the order counts: nothing moves between one command's end and the next one's start.
+        # Only the order matters: the robot stands between commands.
         return np.append(stamps[0] - 10**9, stamps), "one image before and after each command"
     if images.video:
-        frame = np.arange(len(images))
-        return np.rint(frame * (1e9 / _rate(images.video))).astype(np.int64), "the video's rate"
+        period = 1e9 / _frame_rate(images.video)
+        return np.rint(np.arange(len(images)) * period).astype(np.int64), "the video's rate"
     try:
         return np.array([stamp(Path(name).stem) for name in images.names]), "the images' names"
     except ValueError:
@@ -40,7 +40,7 @@ def image_times(images, odometry, table=None):
     )
 
 
-def _rate(path):
+def _frame_rate(path):
     """Frames per second of a video."""
     video = cv2.VideoCapture(str(path))
     try:
@@ -48,15 +48,15 @@ def _rate(path):
     finally:
         video.release()
     if not 0 < rate < 1e4:
-        raise ValueError(f"{path}: says no frame rate; give a frames.csv (image,time_s)")
+        raise ValueError(f"{path}: has no frame rate; give a frames.csv (image,time_s)")
     return rate
 
 
-def _beside(images):
-    """The `frames.csv` of the images' folder, or of the folder above it."""
+def _find_table(images):
+    """The `frames.csv` of the images' folder or of the folder above it, or None."""
     folder = images.video.parent if images.video else Path(images.files[0]).parent
-    places = [folder / "frames.csv", folder.parent / "frames.csv"]
-    return next((place for place in places if place.is_file()), None)
+    tables = [folder / "frames.csv", folder.parent / "frames.csv"]
+    return next((table for table in tables if table.is_file()), None)
 
 
 def _from_table(images, path):
@@ -69,7 +69,7 @@ def _from_table(images, path):
         name = Path(cells[0].strip('"')).name
         try:
             if len(cells) != 2 or name in times:
-                raise ValueError("is twice there" if name in times else "two columns are needed")
+                raise ValueError("is listed twice" if name in times else "two columns are needed")
             times[name] = stamp(cells[1])
         except ValueError as err:
             raise ValueError(f"{path}, line {number}: {name!r}: {err}") from None

@@ -1,8 +1,8 @@
-"""Vertical lines of an omnidirectional image, with bearing, extent and the colours beside them.
+"""Vertical lines of an omnidirectional image: bearing, extent, and the colours beside them.
 
-The paper's section III-B.2, on a panorama that the calibrated camera makes. A line that is vertical
-in the world stands in one column there, so its bearing is found from all its rows at once, and how
-much blocks of rows differ tells how good it is.
+The paper's section III-B.2, on a panorama from the calibrated camera. A vertical line of the world
+occupies one column of it, so all its rows together give its bearing, and the scatter of blocks of
+rows gives the bearing's standard deviation.
 """
 
 from dataclasses import dataclass
@@ -12,30 +12,31 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from jaxslam.vision.camera import Camera
 from jaxslam.vision.edge_localisation import fit_segments, mean
 from jaxslam.vision.edges import PAD, find_edges
 from jaxslam.vision.images import check_size
-from jaxslam.vision.line_merging import merged, separated
+from jaxslam.vision.line_merging import merge_pieces, separate_close_pairs
 from jaxslam.vision.panorama import panorama, unwrap
 
-BESIDE = (2, 3, 4)  # columns away from the edge whose mean is the colour beside it
-STEP = np.sqrt(2 * pi)  # height of an edge over width and largest gradient of it
-LEAST_HALF = 6  # rows
-WIDEST = 1.5  # columns: width of the softest edge that is looked for
-SOFTER, RAMP = 1.1, 0.5  # an edge so much wider than most may be off by this share of its width
+BESIDE = (2, 3, 4)  # columns from an edge over which the colour beside it is averaged
+STEP = np.sqrt(2 * pi)  # contrast of an edge over (its width x its largest gradient)
+LEAST_HALF = 6  # rows of half a line
+WIDEST = 1.5  # columns, width of the softest edge to detect
+SOFTER, RAMP = 1.1, 0.5  # an edge wider than most by SOFTER may be off by RAMP of its width
 
 
 @dataclass(frozen=True)
 class LineSettings:
-    """What counts as a line; validated when made.
+    """What counts as a line. Raises `ValueError` for values out of range.
 
-    `columns` of the panorama, `elevation` (low, high) [rad] of it (None: the camera's);
-    `contrast`: step at an edge, of the image's mean level, RMS over the colours; `significance`
-    [times the noise of its row]; `evidence`: gradient per column of the mean level, times the root
-    of the rows; `sharpness` of that of most lines; `length` [rad] at least, `gap` [rad] within it
-    at most, `slope` [columns per row] it may lean; `merge_bearing` and `merge_gap` [rad] between
-    pieces of one line; `floor` [rad] of a bearing's standard deviation. `merge` pieces; use
-    `colour`, or brightness alone.
+    `columns` and `elevation` (low, high) [rad] (None: the camera's) of the panorama. Least
+    `contrast` of an edge, relative to the image's mean level, RMS over the colours; `significance`
+    in units of its row's noise; `evidence`: gradient per column, relative to the mean level, times
+    the square root of the rows; `sharpness`, relative to the median line's; and `length` [rad].
+    Largest `gap` [rad] in a line and `slope` [columns per row]. `merge` pieces of one line that are
+    at most `merge_bearing` and `merge_gap` [rad] apart. `floor` [rad] of a bearing's standard
+    deviation. `colour`: use colours, or brightness alone.
     """
 
     columns: int = 1440
@@ -67,10 +68,10 @@ class LineSettings:
 class Lines(NamedTuple):
     """n vertical lines sorted by bearing, in the robot's frame.
 
-    `bearing` [n] rad in (-pi, pi], `sigma` [n] rad its standard deviation, `low` and `high` [n] rad
-    elevations of the ends, `polarity` [n] int, 1: brighter on the left (greater azimuth), else -1,
-    `colour` float32 [n, 2, 3] 0..1 left and right of it, BGR, `strength` [n] gradient per column
-    over the image's mean level, root of the summed squares over its rows.
+    `bearing` [n] rad in (-pi, pi]; `sigma` [n] rad, its standard deviation; `low` and `high` [n]
+    rad, elevations of the ends; `polarity` [n] int, 1: brighter on the left (greater azimuth), else
+    -1; `colour` float32 [n, 2, 3] 0..1, left and right of it, BGR; `strength` [n]: gradient per
+    column relative to the image's mean level, root of the sum of squares over its rows.
     """
 
     bearing: np.ndarray
@@ -82,28 +83,28 @@ class Lines(NamedTuple):
     strength: np.ndarray
 
     def take(self, index):
-        """The lines of an index or mask."""
+        """The lines selected by an index or mask."""
         return Lines(*(field[index] for field in self))
 
 
-def extract_lines(image, camera, settings=None):
-    """`Lines` of an image uint8 [H, W, 3], maybe none at all.
+def extract_lines(image: np.ndarray, camera: Camera, settings: LineSettings | None = None) -> Lines:
+    """Extract the `Lines` of an image uint8 [H, W, 3]; there may be none.
 
-    Raises `ValueError` when the image is not of the camera's size.
+    Raises `ValueError` if the camera is calibrated for another size.
     """
     settings = settings or LineSettings()
     view, picture = _panorama(image, camera, settings)
     edges, level = _edges(picture, view, settings)
     lines = _lines(edges, picture, view, settings, level)
     if settings.merge:
-        lines = merged(lines, settings.merge_bearing, settings.merge_gap)
+        lines = merge_pieces(lines, settings.merge_bearing, settings.merge_gap)
     return lines.take(np.argsort(lines.bearing, kind="stable"))
 
 
 def halves(image, camera, settings=None):
-    """Bearings [n] rad of the upper and of the lower halves of the lines of twice the least length.
+    """Bearings [n] rad of the upper and of the lower halves of lines at least twice `length` long.
 
-    They differ where the camera's tilt or calibration is wrong.
+    They differ if the camera's tilt or calibration is wrong.
     """
     settings = settings or LineSettings()
     view, picture = _panorama(image, camera, settings)
@@ -111,7 +112,7 @@ def halves(image, camera, settings=None):
     wide = _columns_per_pixel(view)
     fit = fit_segments(edges, wide)
     keep = _upright(fit, view, settings, level)
-    keep &= (fit.last - fit.first) * _row_height(view) >= 2 * settings.length
+    keep &= (fit.last - fit.first) * view.row_height >= 2 * settings.length
     lower = edges.row > ((fit.first + fit.last) / 2)[edges.segment]
     count = [np.bincount(edges.segment, part, len(keep)) for part in (~lower, lower)]
     keep &= np.minimum(*count) >= LEAST_HALF
@@ -130,34 +131,34 @@ def _panorama(image, camera, settings):
 
 
 def _edges(picture, view, settings):
-    """`Edges` of a panorama uint8 [H, W, 3], and its mean level, which contrast is relative to."""
-    seen = picture if settings.colour else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)[..., None]
-    levels = cv2.mean(seen, view.valid.view(np.uint8))
-    level = max(float(np.mean(levels[: seen.shape[2]])), 1.0)
+    """`Edges` of a panorama uint8 [H, W, 3], and its mean level, the unit of contrast."""
+    channels = picture if settings.colour else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)[..., None]
+    levels = cv2.mean(channels, view.valid.view(np.uint8))
+    level = max(float(np.mean(levels[: channels.shape[2]])), 1.0)
     length, gap = (
-        max(2, round(angle / _row_height(view))) for angle in (settings.length, settings.gap)
+        max(2, round(angle / view.row_height)) for angle in (settings.length, settings.gap)
     )
     contrast = settings.contrast * level / STEP / WIDEST
     edges = find_edges(
-        seen, view.valid, contrast, settings.significance, length, gap, settings.slope
+        channels, view.valid, contrast, settings.significance, length, gap, settings.slope
     )
     return edges, level
 
 
 def is_dark(image, level=12.0):
-    """Whether an image is too dark to look for lines: its mean is below `level` of 255."""
+    """Whether an image is too dark for lines: its mean is below `level` of 255."""
     return float(np.mean(image)) < level
 
 
 def _lines(edges, picture, view, settings, level):
-    """`Lines` of the segments that stand upright, each once (the seam's repeat left out)."""
+    """`Lines` of the upright segments, without those that the padding repeats at the seam."""
     fit = fit_segments(edges, _columns_per_pixel(view))
     keep = _upright(fit, view, settings, level)
     usual = np.median(fit.width[keep]) if keep.any() else 1.0
     index = np.flatnonzero(keep)
     blurred = np.clip(fit.width[index] ** 2 - (SOFTER * usual) ** 2, 0, None)
     scatter = np.sqrt(fit.scatter[index] ** 2 + RAMP**2 * blurred)
-    half = _row_height(view) / 2
+    half = view.row_height / 2
     lines = Lines(
         bearing=view.bearing(fit.column[index] - PAD),
         sigma=np.hypot(scatter * view.step, settings.floor),
@@ -167,14 +168,14 @@ def _lines(edges, picture, view, settings, level):
         colour=_colours(edges, picture, fit)[index],
         strength=fit.strength[index] / level,
     )
-    return separated(lines, usual * view.step)
+    return separate_close_pairs(lines, usual * view.step)
 
 
 def _upright(fit, view, settings, level):
-    """Mask [n] of the segments that are lines: upright, strong enough, sharp, in the panorama."""
+    """Mask [n] of the segments that are lines: upright, strong, sharp, and not in the padding."""
     keep = (np.abs(fit.slope) <= settings.slope) & (fit.strength >= settings.evidence * level)
     keep &= (fit.column >= PAD - 0.5) & (fit.column < PAD + len(view.azimuth) - 0.5)
-    if keep.any():  # what is softer than most edges is a shadow
+    if keep.any():  # an edge that is softer than most is a shadow
         step = STEP * np.median(fit.width[keep]) * fit.strength / np.sqrt(fit.rows)
         keep &= fit.sharp >= settings.sharpness * np.median(fit.sharp[keep])
         keep &= step >= settings.contrast * level
@@ -182,7 +183,7 @@ def _upright(fit, view, settings, level):
 
 
 def _colours(edges, picture, fit):
-    """Mean colour [n, 2, 3] in 0..1 on the left and on the right over a segment's rows."""
+    """Mean colour [n, 2, 3], 0..1, left and right of each segment over its rows."""
     n, width, segment = len(fit.column), picture.shape[1], edges.segment
     inside = (edges.row >= fit.first[segment]) & (edges.row <= fit.last[segment])
     row, segment = edges.row[inside], segment[inside]
@@ -195,12 +196,8 @@ def _colours(edges, picture, fit):
     return (np.stack(sides, 1) / 255).astype(np.float32)
 
 
-def _row_height(view):
-    return (view.elevation[0] - view.elevation[-1]) / (len(view.elevation) - 1)
-
-
 def _columns_per_pixel(view, stride=90):
-    """How many columns [H] a pixel of the image is wide in each row of a `Panorama`."""
+    """Width [H] of an image pixel, in columns, in each row of a `Panorama`."""
     step = [
         part[:, 1::stride].astype(float) - part[:, :-1:stride] for part in (view.map_x, view.map_y)
     ]

@@ -1,4 +1,4 @@
-"""Vertical lines drawn over the panorama and over the image they were found in."""
+"""Draw vertical lines into the panorama and into the image."""
 
 import cv2
 import numpy as np
@@ -8,7 +8,7 @@ SUBPIXEL = 4  # bits of OpenCV's fixed-point coordinates
 
 
 def draw_lines(panorama_image, lines, view):
-    """A copy of the picture [H, W, 3] with the lines, coloured by polarity, at their columns."""
+    """Draw lines, coloured by polarity, into a copy of the panorama [H, W, 3]."""
     out = panorama_image.copy()
     column, top, bottom = view.column(lines.bearing), view.row(lines.high), view.row(lines.low)
     for i, polarity in enumerate(lines.polarity):
@@ -18,16 +18,16 @@ def draw_lines(panorama_image, lines, view):
 
 
 def draw_on_image(image, lines, camera, points=24):
-    """A copy of the image [H, W, 3] with the lines, as the camera sees them (bent or radial)."""
+    """Draw lines as the camera projects them into a copy of the image [H, W, 3]."""
     out = image.copy()
     for i, polarity in enumerate(lines.polarity):
         up = np.linspace(lines.low[i], lines.high[i], points)
         level = np.cos(up)
         direction = [level * np.cos(lines.bearing[i]), level * np.sin(lines.bearing[i]), np.sin(up)]
         pixel = camera.project(np.stack(direction, -1))
-        seen = pixel[np.isfinite(pixel[:, 0])]
-        if len(seen) > 1:
-            _draw(out, seen, BRIGHT_LEFT if polarity > 0 else BRIGHT_RIGHT)
+        visible = pixel[np.isfinite(pixel[:, 0])]
+        if len(visible) > 1:
+            _draw(out, visible, BRIGHT_LEFT if polarity > 0 else BRIGHT_RIGHT)
     return out
 
 

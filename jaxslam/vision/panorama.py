@@ -1,7 +1,7 @@
-"""Other views of an omnidirectional image: panorama, perspective, bird's eye.
+"""Views of an omnidirectional image: panorama, perspective, bird's eye.
 
-Each is one cached table of where its pixels lie in the image, made from the calibrated camera, so
-that the misalignment of mirror, lens and mount is gone from the view.
+Each is a cached table of image coordinates computed from the calibrated camera, so that views are
+free of misalignments of mirror, lens and mount.
 """
 
 from functools import lru_cache
@@ -12,15 +12,14 @@ import cv2
 import numpy as np
 
 LEAST_ROWS, MOST_ROWS = 16, 2048
-CACHED = 8  # views; a panorama of 1,440 columns takes 3 MB
+CACHED = 8  # views kept; a panorama of 1,440 columns takes 3 MB
 
 
 class Panorama(NamedTuple):
     """Azimuth over elevation, evenly spaced in both, left on the left.
 
     `azimuth` [W] rad, descending from pi to -pi: ahead is in the middle; `elevation` [H] rad,
-    descending; both at the pixels' centres. `map_x`, `map_y` float32 [H, W]: the place in the
-    image; `valid` bool [H, W]: it is in the image.
+    descending; both at the pixels' centres. `map_x`, `map_y`, `valid` as in `View`.
     """
 
     azimuth: np.ndarray
@@ -34,9 +33,14 @@ class Panorama(NamedTuple):
         """Spacing [rad] of the columns."""
         return 2 * pi / len(self.azimuth)
 
+    @property
+    def row_height(self):
+        """Spacing [rad] of the rows."""
+        return (self.elevation[0] - self.elevation[-1]) / (len(self.elevation) - 1)
+
     def bearing(self, column):
-        """Azimuth [rad] in (-pi, pi] of fractional columns, which may lie beyond the seam."""
-        return _wrapped(pi - (np.asarray(column) + 0.5) * self.step)
+        """Azimuth [rad] in (-pi, pi] of fractional columns, also beyond the seam."""
+        return _wrap(pi - (np.asarray(column) + 0.5) * self.step)
 
     def column(self, bearing):
         """Fractional column in [-0.5, W - 0.5) of an azimuth [rad]."""
@@ -49,7 +53,7 @@ class Panorama(NamedTuple):
 
 
 class View(NamedTuple):
-    """`map_x`, `map_y` float32 [H, W]: the place in the image; `valid` bool [H, W]: it is there."""
+    """`map_x`, `map_y` float32 [H, W]: image coordinates; `valid` bool [H, W]: inside the image."""
 
     map_x: np.ndarray
     map_y: np.ndarray
@@ -60,8 +64,8 @@ class View(NamedTuple):
 def panorama(camera, columns=1440, elevation=None):
     """`Panorama` of a camera; cached, read-only.
 
-    `elevation` (low, high) [rad], None: the camera's. There are as many rows as the image has
-    pixels between the two. Raises `ValueError` where the camera sees nothing of it.
+    `elevation` (low, high) [rad], None: the camera's. The number of rows is that of the image's
+    pixels between the two. Raises `ValueError` if the camera sees none of these elevations.
     """
     low, high = camera.elevation if elevation is None else elevation
     if not (isinstance(columns, int) and 16 <= columns <= 1 << 14):
@@ -73,14 +77,15 @@ def panorama(camera, columns=1440, elevation=None):
     edges = np.linspace(high, low, rows + 1)
     up = (edges[1:] + edges[:-1]) / 2
     view = _view(camera, directions(azimuth[None, :], up[:, None]))
-    return Panorama(_fixed(azimuth), _fixed(up), *view)
+    return Panorama(_freeze(azimuth), _freeze(up), *view)
 
 
 @lru_cache(maxsize=CACHED)
 def perspective(camera, azimuth=0.0, elevation=0.0, field=pi / 2, width=640, height=480):
-    """`View` of a pinhole camera that looks to (azimuth, elevation) [rad]; cached.
+    """`View` of a pinhole camera pointing to (azimuth, elevation) [rad]; cached.
 
-    `field` [rad] is its horizontal angle of view. Black where the camera sees nothing.
+    `field` [rad]: horizontal angle of view. Black where the camera sees nothing. Raises
+    `ValueError` for a field of 0, or pi and more.
     """
     if not 0 < field < pi:
         raise ValueError(f"perspective: field {field:g} rad; must be within 0 to pi")
@@ -96,10 +101,11 @@ def perspective(camera, azimuth=0.0, elevation=0.0, field=pi / 2, width=640, hei
 
 @lru_cache(maxsize=CACHED)
 def birds_eye(camera, extent=4.0, size=512):
-    """`View` of the floor from above, ahead is up; cached.
+    """`View` of the floor from above with the robot's heading upwards; cached.
 
-    `extent` [m]: half the side of the square round the robot's origin; `size` px. The camera's
-    height above the floor is its `position`. Black where it does not see the floor.
+    `extent` [m]: half the side of a square around the robot's origin; `size` px. The camera's
+    height is part of its `position`. Black where it does not see the floor. Raises `ValueError` if
+    the height is not above 0.
     """
     if camera.position[2] <= 0:
         height = camera.position[2]
@@ -110,12 +116,12 @@ def birds_eye(camera, extent=4.0, size=512):
 
 
 def unwrap(image, view):
-    """The image [H, W] or [H, W, 3] seen as a `Panorama` or `View`; black outside the image."""
+    """Resample the image [H, W] or [H, W, 3] as a `Panorama` or `View`; black outside the image."""
     return cv2.remap(image, view.map_x, view.map_y, cv2.INTER_LINEAR)
 
 
 def _extent(camera, low, high):
-    """(low, high) [rad] that is seen from anywhere, and the pixels between them."""
+    """Elevations (low, high) [rad] visible at any azimuth, and the number of pixels between."""
     up = np.linspace(low, high, 721)
     azimuth = np.linspace(-pi, pi, 72, endpoint=False)
     pixel = camera.project(directions(azimuth[:, None], up[None, :]))
@@ -143,18 +149,18 @@ def _view(camera, direction):
     up = np.arcsin(direction[..., 2] / np.linalg.norm(direction, axis=-1))
     low, high = camera.elevation
     with np.errstate(invalid="ignore"):
-        # between centres of pixels: beyond them there is nothing to interpolate with
+        # Within the outermost pixels' centres, beyond which interpolation is impossible.
         valid = ((pixel >= 0) & (pixel <= np.array([camera.width, camera.height]) - 1)).all(-1)
     valid &= (up >= low - 1e-9) & (up <= high + 1e-9)
     pixel = np.where(valid[..., None], pixel, -2.0).astype(np.float32)
-    return View(_fixed(pixel[..., 0].copy()), _fixed(pixel[..., 1].copy()), _fixed(valid))
+    return View(_freeze(pixel[..., 0].copy()), _freeze(pixel[..., 1].copy()), _freeze(valid))
 
 
-def _fixed(array):
+def _freeze(array):
     array.setflags(write=False)
     return array
 
 
-def _wrapped(angle):
-    """The angle [rad] in (-pi, pi]."""
+def _wrap(angle):
+    """Wrap an angle [rad] to (-pi, pi]."""
     return pi - (pi - angle) % (2 * pi)

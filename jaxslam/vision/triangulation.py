@@ -1,8 +1,8 @@
-"""Points from two bearings and the motion between them (paper, section III-B), with their error.
+"""Triangulate points from two bearings and the motion between (paper, section III-B), with errors.
 
 A point X lies on two rays. In the frame of the second sensor the ray of the second bearing b2 has
 direction u2 = (cos b2, sin b2) and starts at zero; that of the first has direction u1 at angle
-b1 - theta and starts where the sensor was, p = -R(-theta) t, for the motion (t, theta). With the
+b1 - theta and starts at the first sensor, p = -R(-theta) t, for the motion (t, theta). With the
 ranges r1, r2 along them, and n = (-sin, cos) the normal of a ray,
 
     r2 = p x u1 / sin(b1 - theta - b2),    r1 = p x u2 / sin(b1 - theta - b2),
@@ -32,8 +32,8 @@ REASONS = (
 
 @dataclass(frozen=True)
 class TriangulationSettings:
-    """`least_baseline` m: shorter motion is none. `parallax`: the rays' angle in units of its
-    standard deviation, below which they count as parallel. `nearest`, `farthest` m."""
+    """Limits: `least_baseline` m of the motion; `parallax`: least angle between the rays, in
+    standard deviations; `nearest` and `farthest` m, of the ranges."""
 
     least_baseline: float = 0.03
     parallax: float = 4.0
@@ -42,13 +42,13 @@ class TriangulationSettings:
 
 
 class Points(NamedTuple):
-    """m points in the frame of the second sensor, NaN where refused.
+    """m points in the frame of the second sensor, NaN where rejected.
 
-    `point` [m, 2] m; `cov` [m, 3] (xx, xy, yy) m^2 of everything that is white: the noise of both
-    bearings and of the motion. `by_bias` [m, 2] m/rad: the point's derivative with respect to an
-    error that both bearings have in common (a camera turned on its mount, a calibration's bias);
-    such an error repeats from pair to pair, doesn't average out, and is not in `cov`. `parallax`
-    [m]: the rays' angle in its standard deviations. `reason` [m]: index into `REASONS`; `ok` [m].
+    `point` [m, 2] m; `cov` [m, 3] (xx, xy, yy) m^2 from white noise of both bearings and of the
+    motion. `by_bias` [m, 2] m/rad: derivative of the point by an error common to both bearings (a
+    camera turned on its mount, a calibration's bias); it repeats from pair to pair, doesn't average
+    out, and is not part of `cov`. `parallax` [m]: angle between the rays in standard deviations.
+    `reason` [m]: index into `REASONS`; `ok` [m].
     """
 
     point: np.ndarray
@@ -63,12 +63,12 @@ class Points(NamedTuple):
 
 
 def triangulate(bearing, sigma, motion, motion_cov, settings=None):
-    """`Points` of m lines.
+    """Triangulate m lines: `Points`.
 
-    `bearing` [m, 2] rad in the first and second sensor frame, `sigma` [m, 2] or a number their
-    standard deviations, `motion` [3] or [m, 3] the second sensor's pose in the first one's frame,
-    `motion_cov` [3, 3] or [m, 3, 3] its covariance. Bearings are taken as independent of each
-    other and of the motion.
+    `bearing` [m, 2] rad in the first and second sensor frame; `sigma`, [m, 2] or a number, their
+    standard deviations; `motion` [3] or [m, 3]: pose (x, y, heading) of the second sensor in the
+    frame of the first; `motion_cov` [3, 3] or [m, 3, 3], its covariance. Errors of the bearings and
+    of the motion are assumed independent.
     """
     settings = TriangulationSettings() if settings is None else settings
     bearing = np.asarray(bearing, float).reshape(-1, 2)
@@ -82,8 +82,8 @@ def triangulate(bearing, sigma, motion, motion_cov, settings=None):
         by_bearing, by_motion = jacobian[..., :2], jacobian[..., 2:]
         cov = np.einsum("mij,mj,mkj->mik", by_bearing, sigma**2, by_bearing)
         cov += np.einsum("mij,mjl,mkl->mik", by_motion, motion_cov, by_motion)
-        # Range goes as 1 / sin(angle between the rays), so to first order the relative error of
-        # the one is that of the other; the motion's share in it is then counted too.
+        # Range is proportional to 1 / sin(angle between the rays), so to first order the relative
+        # errors of range and angle are equal. This includes the motion's error.
         ray = np.column_stack([np.cos(bearing[:, 1]), np.sin(bearing[:, 1])])
         along = np.sqrt(np.einsum("mi,mij,mj->m", ray, cov, ray))
         parallax = np.abs(ranges[:, 1]) / along
@@ -99,7 +99,7 @@ def triangulate(bearing, sigma, motion, motion_cov, settings=None):
 
 
 def _intersect(bearing, motion):
-    """Points [m, 2], their derivatives [m, 2, 5] by (b1, b2, tx, ty, theta), ranges [m, 2]."""
+    """Intersections [m, 2], derivatives [m, 2, 5] by (b1, b2, tx, ty, theta), ranges [m, 2]."""
     theta = motion[:, 2]
     c, s = np.cos(theta), np.sin(theta)
     back = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], 1)  # R(-theta)
@@ -123,7 +123,7 @@ def _intersect(bearing, motion):
 
 
 def _reasons(ranges, parallax, baseline, settings):
-    """Index into `REASONS` per line; the first that applies."""
+    """Index [m] of the first of `REASONS` that applies."""
     far, near = ranges.max(axis=1), ranges.min(axis=1)
     conditions = [
         baseline < settings.least_baseline,
@@ -136,7 +136,7 @@ def _reasons(ranges, parallax, baseline, settings):
 
 
 def compose(first, first_cov, second, second_cov):
-    """Motion `first` [w, 3] followed by `second` [3], with covariances, errors independent."""
+    """Compose motions `first` [w, 3] and `second` [3] with independent errors; mean, covariance."""
     c, s = np.cos(first[:, 2]), np.sin(first[:, 2])
     x, y, turn = second
     ahead = np.column_stack([c * x - s * y, s * x + c * y])
@@ -151,11 +151,11 @@ def compose(first, first_cov, second, second_cov):
     return mean, cov
 
 
-def of_sensor(mean, cov, mounting):
-    """Motion of a sensor mounted at (x, y, yaw), from that of the robot; [T, 3] and [T, 3, 3]."""
+def sensor_motion(mean, cov, mounting):
+    """Motion [T, 3] of a sensor mounted at (x, y, yaw) and its covariance, from the robot's."""
     mx, my, yaw = mounting
     c, s = np.cos(mean[:, 2]), np.sin(mean[:, 2])
-    # Where the sensor is after the motion, less where it was; then seen from its own axes.
+    # Displacement of the sensor, in the axes of its first pose.
     swung = np.column_stack([c * mx - s * my, s * mx + c * my])
     axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
     moved = (mean[:, :2] + swung - (mx, my)) @ axes.T

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from calibration.bundle import Corners, derivatives, rotation
-from calibration.camera import calibrate_camera, calibrate_corners, held_out
+from calibration.camera import calibrate_camera, calibrate_corners, cross_validate
 from calibration.camera_report import draw, text
 from calibration.coverage import angle_change, azimuth_error
 from calibration.initial import first_solution
@@ -213,7 +213,7 @@ def test_doubtful_sets_are_warned_of():
     given["pixels"][9] = given["pixels"][10] = given["pixels"][2].copy()
     told = " / ".join(calibrate_corners(**given).warnings)
     assert "all boards are at one distance" in told
-    assert "board 2 and board 9 are the same picture: one counts twice (1 more" in told
+    assert "board 2 and board 9 are the same picture, which counts twice (1 more" in told
 
 
 @pytest.mark.parametrize(
@@ -232,14 +232,14 @@ def test_report_and_picture(tmp_path):
     given["pixels"][7][11] += [9.0, -7.0]
     found = calibrate_corners(**given)
     told = text(found)
-    assert "board 11" in told and "outlier left aside: board 7, corner 11" in told
+    assert "board 11" in told and "outlier excluded: board 7, corner 11" in told
     assert f"{found.rms:.3f}" in told and f"{found.bearings.rms_deg:.3f}°" in told
     draw(found, tmp_path / "camera.png")
     assert (tmp_path / "camera.png").stat().st_size > 50_000
 
 
 def held_out_px(found, order=None):
-    length = held_out(found.corners, {found.order: found.solution}, "polynomial", found.order)
+    length = cross_validate(found.corners, {found.order: found.solution}, "polynomial", found.order)
     d = length[found.order]
     return d.mean(), np.sqrt(np.mean(d**2))
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from stripes import mirror_camera, painted, photograph, room_of_stripes, stripes
 
-from calibration.tilt import Tilt, camera_with_tilt, camera_with_up, describe, tilt
+from calibration.tilt import Tilt, camera_with_tilt, camera_with_up, describe, find_tilt
 from jaxslam.vision.camera import tilt_matrix
 from jaxslam.vision.camera_files import load_camera
 from jaxslam.vision.images import Images
@@ -25,7 +25,7 @@ def rooms(camera, count, noise=3.0):
 def test_roll_and_pitch_are_found_to_a_hundredth_of_a_degree(true):
     roll, pitch = np.radians(true)
     camera = mirror_camera(roll=roll, pitch=pitch, yaw=0.7)
-    found = tilt(rooms(camera, 2), replace(camera, roll=0.0, pitch=0.0))
+    found = find_tilt(rooms(camera, 2), replace(camera, roll=0.0, pitch=0.0))
     assert np.abs(degrees(found) - true).max() < 0.02
     assert found.lines > 40 and found.images == 2 and found.skipped == {}
     again = camera_with_tilt(camera, found)
@@ -38,7 +38,7 @@ def test_a_tilt_already_in_the_camera_is_kept_or_corrected():
     camera = mirror_camera(roll=0.02, pitch=-0.01)
     images = rooms(camera, 1)
     for start in (camera, replace(camera, roll=-0.01, pitch=0.02)):
-        assert np.abs(degrees(tilt(images, start)) - np.degrees([0.02, -0.01])).max() < 0.03
+        assert np.abs(degrees(find_tilt(images, start)) - np.degrees([0.02, -0.01])).max() < 0.03
 
 
 def test_leaning_edges_do_not_pull_it_along():
@@ -57,7 +57,7 @@ def test_leaning_edges_do_not_pull_it_along():
         return colour[i]
 
     image = photograph(painted(camera, seen, samples=10), 2.0, 0.5)
-    found = tilt([("a", image)], replace(camera, roll=0.0, pitch=0.0))
+    found = find_tilt([("a", image)], replace(camera, roll=0.0, pitch=0.0))
     assert np.abs(degrees(found) - np.degrees([0.01, 0.015])).max() < 0.1
     assert found.lines < found.candidates
 
@@ -66,7 +66,7 @@ def test_standard_errors_are_those_of_repeated_trials():
     camera = mirror_camera()
     ratios = []
     for image in rooms(camera, 8, noise=8.0):
-        found = tilt([image], camera)
+        found = find_tilt([image], camera)
         ratios.append([found.roll, found.pitch] / np.sqrt(np.diag(found.covariance)))
     assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 2.5
 
@@ -98,16 +98,16 @@ def test_images_without_lines_or_of_another_size_are_counted():
     small = np.zeros((48, 64, 3), np.uint8)
     images = [*rooms(camera, 1), ("b.png", small), ("c.png", ValueError("c.png: truncated"))]
     calls = []
-    found = tilt(images, camera, progress=lambda done, total: calls.append((done, total)))
+    found = find_tilt(images, camera, progress=lambda done, total: calls.append((done, total)))
     assert found.images == 1
     assert sorted(found.skipped.values()) == [1, 1]
     assert any("64 x 48" in reason for reason in found.skipped)
     assert calls[-1] == (12, 12)
     plain = photograph(np.full((480, 640, 3), 99.0), 2.0)
     with pytest.raises(ValueError, match=r"tilt: 0 nearly vertical lines in 1 images"):
-        tilt([("d.png", plain)], camera)
+        find_tilt([("d.png", plain)], camera)
     with pytest.raises(ValueError, match=r"in 0 images; .* 1 skipped: truncated"):
-        tilt(images[2:], camera)
+        find_tilt(images[2:], camera)
 
 
 def test_lines_on_one_side_alone_do_not_determine_it():
@@ -118,13 +118,13 @@ def test_lines_on_one_side_alone_do_not_determine_it():
         (str(i), photograph(stripes(camera, azimuth, colour), 2.0, 0.5, seed=i)) for i in range(2)
     ]
     with pytest.raises(ValueError, match="one direction"):
-        tilt(images, camera)
+        find_tilt(images, camera)
 
 
 def test_a_camera_that_leans_far_is_refused():
     camera = mirror_camera(roll=0.3)
     with pytest.raises(ValueError, match="tilt: "):
-        tilt(rooms(camera, 2), replace(camera, roll=0.0))
+        find_tilt(rooms(camera, 2), replace(camera, roll=0.0))
 
 
 def test_a_recorded_camera_leans_as_far_as_others_found(shared_data):
@@ -133,7 +133,7 @@ def test_a_recorded_camera_leans_as_far_as_others_found(shared_data):
     camera = load_camera(folder / "calib_results_catadioptric.txt", mirror=True)
     camera = replace(camera, elevation=(-0.87, 0.43))
     images = list(Images(folder))
-    found = tilt(images, camera)
+    found = find_tilt(images, camera)
     assert 0.25 < np.hypot(*degrees(found)) < 0.59
     before, after = (
         np.concatenate([np.subtract(*halves(image, c)) for _, image in images])

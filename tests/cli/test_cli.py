@@ -13,12 +13,12 @@ from small_run import make_refined
 
 from jaxslam.cli import main as cli
 from jaxslam.logs.log_file import load_log, save_log
-from jaxslam.reference import compare, variants
+from jaxslam.reference import compare
 from jaxslam.results import load
 from jaxslam.runs import run as runner
 from jaxslam.simulation import planar as simulate
 
-MANY = ("--particles", "50", "--no-refine")
+MANY = ("--particles", "50", "--no-smoothing")
 
 
 @pytest.fixture(scope="session")
@@ -138,11 +138,12 @@ def test_options_of_simulate_are_those_of_the_library(at, call, monkeypatch):
     renamed = {"length": "length_m", "rate": "rate_hz", "odometry_rate": "odometry_hz"}
     renamed |= {"stop": "stop_m"}
     options = inspect.signature(cli.planar).parameters.values()
-    library = inspect.signature(simulate.planar).parameters
+    library = inspect.signature(simulate.planar).parameters.values()
+    library = {o.name: o.default for o in library} | simulate.NOISE
     defaults = {renamed.get(o.name, o.name): o.default for o in options}
-    assert defaults.pop("view_range") == library["view"].default[2]
+    assert defaults.pop("view_range") == library["view"][2]
     del defaults["out"], defaults["overwrite"]
-    assert defaults == {name: library[name].default for name in defaults}
+    assert defaults == {name: library[name] for name in defaults}
 
     seen, planar = {}, simulate.planar
 
@@ -202,17 +203,9 @@ def test_compare_shows_both(log, call, monkeypatch, same):
 
     monkeypatch.setattr(compare, "compare", stub)
 
-    def side_by_side(given, config, params, seed, steps, every, baselines, progress):
-        asked.append((config.particles, seed, steps, every, len(baselines)))
-        return [variants.Variant("informed", 70, 0.5, 0.75, np.nan, (3, 1, 0), 0.002)]
-
-    monkeypatch.setattr(variants, "variants", side_by_side)
     words = ["--particles", "3,5", "--paper", "--seed", 2, "--steps", 8, "--every", 4]
-    code, out, err = call("compare", log, *words, "--variants", 70)
-    assert asked == [*((n, "position", False, 2, 8, 4) for n in (3, 5)), (70, 2, 8, 4, 2)]
-    told = out.splitlines()[-1].split()
-    assert told == ["informed", "70", "0.500", "m", "0.750", "m", "-", "3/1/0", "2", "ms"]
-    assert call("compare", log, *words, "--variants", 0)[1] == out[: out.index("\n\n") + 1]
+    code, out, err = call("compare", log, *words)
+    assert asked == [(n, "position", False, 2, 8, 4) for n in (3, 5)]
     assert out.splitlines()[0].split() == ["3", "particles", "5", "particles"]
     assert out.count(f"{same} of 8 steps") == 4
     for text in ("0.125 m RMSE", "0.250 m RMSE", "250 ms", "50 ms", "12.5 ms", "20 times"):
@@ -362,7 +355,7 @@ def test_too_little_memory_is_told_and_a_fault_of_ours_not_hidden(log, refuse, m
         cli.main(["run", log])
 
 
-@pytest.mark.parametrize("place", ["runner.run", "report.summarise"])
+@pytest.mark.parametrize("place", ["runs.run.run", "results.run_folder.summarise"])
 def test_interrupted_while_filtering_or_writing_leaves_nothing(log, call, monkeypatch, place):
     def interrupted(*given, **named):
         raise KeyboardInterrupt

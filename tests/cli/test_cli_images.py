@@ -107,7 +107,7 @@ def test_the_next_step_that_simulate_prints_is_right(at, call):
     code, out, err = call(*command.split())  # a turn: no points, which is said
     assert (code, err) == (
         1,
-        "warning: no points: only jaxslam run --sensor bearing can map this\n",
+        "warning: no points: only jaxslam run --sensor bearing can map this log\n",
     )
     assert "not used: bearing without a point: no baseline" in out
 
@@ -178,7 +178,7 @@ def test_odometry_and_images_that_do_not_fit(room, call, refuse):
     rewrite(table, "time_s,distance_m,turn_rad " + " ".join(f"{k},0,0" for k in range(1, 8)))
     code, out, err = call(*EXTRACT, "--overwrite")
     assert code == 1 and "7 not used: image without motion since the one before" in out
-    assert err == "warning: no points: only jaxslam run --sensor bearing can map this\n"
+    assert err == "warning: no points: only jaxslam run --sensor bearing can map this log\n"
 
 
 def test_images_out_of_order_are_sorted_and_counted(room, call):
@@ -222,7 +222,7 @@ def test_places_that_are_none(room, at, refuse):
     assert "none.toml: can't be read" in refuse(*replaced("room/camera.toml", "none.toml"))
     told = refuse(*replaced("room/camera.toml", "room/poses.csv"))
     assert "poses.csv: a camera file ends in one of .toml, .txt, .yaml, .yml" in told
-    assert "seed is no field" in refuse(*replaced("room/camera.toml", "room/room.toml"))
+    assert "seed is not a field" in refuse(*replaced("room/camera.toml", "room/room.toml"))
     assert "log.dat: a log is a .npz file; name it like log.npz" in refuse(
         *replaced("log.npz", "log.dat")
     )
@@ -238,7 +238,7 @@ def test_drawings_never_replace_the_images(room, at, call, refuse):
     before = (room / "images" / "000000.png").read_bytes()
     for more in ((), ("--overwrite",)):
         line = refuse(*EXTRACT, "--overlay", "room/../room/images", *more)
-        assert "the images themselves are there; choose another for drawings" in line
+        assert "the images themselves are there; choose another place for drawings" in line
     (at / "lines.avi").write_bytes(b"mine")
     assert "lines.avi: exists; choose another" in refuse(*EXTRACT, "--overlay", "lines.avi")
     assert "exists; choose another name or add --overwrite" in refuse(*EXTRACT, "--overlay", room)
@@ -261,7 +261,7 @@ def test_interrupted_and_gone_on(room, at, call, monkeypatch):
     code, out, err = call(*words)
     assert (code, out) == (130, "")
     assert err.splitlines() == [
-        "warning: stopped; the same command again goes on from here",
+        "warning: stopped; repeat the command to resume",
         "jaxslam: interrupted",
     ]
     assert not (at / "log.npz").exists()
@@ -307,7 +307,7 @@ def test_a_sensors_errors_from_a_straight_drive(at, call, refuse):
     code, out, err = call(*words, "--figure", "points.png")
     assert (code, err) == (0, "")
     assert re.search("preferred: (propagated|bearing) normal, by ", out)
-    assert "params.toml: the motion, and the points' scale" in out
+    assert "params.toml: motion and position_scale" in out
     assert (at / "points.png").stat().st_size > 10_000
     assert "params.toml: exists" in refuse(*words)
     base = default_params("position", load_log("straight.npz"))
@@ -332,7 +332,7 @@ def test_the_bundled_log_is_triangulated(at, call, refuse):
     save_log("still.npz", cut(whole, 200))  # hardly moves
     code, out, err = call("triangulate", "still.npz", "none.npz")
     assert code == 1 and ", 0 points" in out
-    assert err == "warning: no points: only jaxslam run --sensor bearing can map this\n"
+    assert err == "warning: no points: only jaxslam run --sensor bearing can map this log\n"
     save_log("short.npz", cut(whole, 1000))
     code, out, err = call("triangulate", "short.npz", "points.npz")
     assert (code, err) == (0, "")

@@ -12,8 +12,8 @@ import pytest
 
 from jaxslam.cli import learn as cli_learn
 from jaxslam.config import Config
-from jaxslam.learning import error_models, uncertainty
 from jaxslam.learning import fit as learn
+from jaxslam.learning import uncertainty
 from jaxslam.logs.log_file import save_log
 from jaxslam.parameter_file import load_learning, load_params
 from jaxslam.parameters import default_params
@@ -98,16 +98,10 @@ def test_from_logs_to_parameters(logs, at, call, refuse):
 
 
 @pytest.mark.slow
-def test_surface_models_and_a_run_with_what_was_learnt(logs, at, call):
+def test_a_run_with_what_was_learned(logs, at, call):
     told = "learn", "a.npz", "--held-out", "b.npz", "--parameters", NAMES, *SMALL, "--steps", "5"
-    code, out, err = call(*told, "--surface", NAMES, "--compare-models", "--overwrite")
+    code, _, err = call(*told, "--overwrite")
     assert code == ("warning: " in err)
-    assert "surface.png" in out
-    assert (at / "surface.png").stat().st_size > 10_000
-    lines = out.splitlines()
-    head = next(i for i, line in enumerate(lines) if line.startswith("error model"))
-    assert {line.split()[0] for line in lines[head + 1 : head + 6]} == set(error_models.NAMES)
-    assert lines[-1].startswith(("the held-out logs prefer ", "no preference: "))
     run = "run", "a.npz", "--params", "params.toml", "--particles", "16", "--no-refine"
     assert call(*run, "--out", "mapped")[0] in (0, 1)
     used = tomllib.loads((at / "mapped" / "run.toml").read_text())["params"]
@@ -225,10 +219,6 @@ def test_caution_becomes_a_part_of_what_is_learnt():
         (("a.npz", "--end", "2", "--held-out", "a.npz", "--held-out-start", "1"), "held out; part"),
         (("a.npz", "--end", "99", "--start", "98"), "no frame between 98 and 99 s"),
         (("a.npz", "--window", "-1"), "windows of -1.0 s; must be above 0"),
-        (("a.npz", "--surface", "err_rot"), "--surface is 'err_rot'; must be two of err_tran"),
-        (("a.npz", "--surface", "err_rot,err_rot"), "must be two of"),
-        (("a.npz", "--surface", "err_rot,detection"), "must be two of"),
-        (("a.npz", "--compare-models"), "--compare-models needs --held-out"),
         (("a.npz", "--out", "fit.csv"), "fit.csv: a file of parameters is a .toml file"),
         (("a.npz", "--out", "new/fit.csv"), "fit.csv: a file of parameters is a .toml file"),
         (("a.npz", "--resume"), "learn.checkpoint.npz: is not there; begin without --resume"),
@@ -247,10 +237,9 @@ def test_what_can_not_be_is_refused_before_computing(logs, refuse, monkeypatch, 
 
 
 def test_files_that_are_there_are_kept(logs, at, refuse):
-    for name in ("learn.csv", "learn.png", "surface.png"):
+    for name in ("learn.csv", "learn.png"):
         (at / name).touch()
-        told = "learn", "a.npz", "--surface", "err_rot,err_drift"
-        assert f"{name}: exists" in refuse(*told)
+        assert f"{name}: exists" in refuse("learn", "a.npz")
         (at / name).unlink()
 
 

@@ -8,7 +8,7 @@ import pytest
 import worlds
 from scipy.optimize import least_squares
 
-from jaxslam import default_params
+from jaxslam import config_for, default_params
 from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.odometry import moments
 from jaxslam.logs.truth import truth_at, wrap
@@ -32,7 +32,7 @@ def independent(log, params, variance, weight):
     The chain is in the robot's poses here, in the sensor's there; `moments` is the motion's closed
     form, here in the frame at the intervals' start.
     """
-    data = frames_from_log(log, "bearing", None, params, True)
+    data = frames_from_log(log, config_for(log, "bearing", "known"), params)
     frame, slot = np.nonzero(data.measurements.valid)
     who, bearing = data.measurements.identity[frame, slot], data.measurements.value[frame, slot, 0]
     mean, cov = moments(data.odometry, params)
@@ -71,7 +71,7 @@ def test_same_solution_as_scipy(log):
     log = replace(log, bearing=wrong)
     found = batch.solve(log, params, rounds=50)
     assert found.settled
-    data = frames_from_log(log, "bearing", None, params, True)
+    data = frames_from_log(log, config_for(log, "bearing", "known"), params)
     frame, slot = np.nonzero(data.measurements.valid)
     who = data.measurements.identity[frame, slot]
     sensor = batch.compose(found.pose, batch.mounting(params))

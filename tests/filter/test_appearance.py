@@ -1,4 +1,4 @@
-"""Looks: what descriptors tell of identity, how the filter learns and uses them."""
+"""Appearance: what descriptors tell of identity, how the filter averages and uses them."""
 
 import dataclasses
 import json
@@ -21,11 +21,11 @@ from jaxslam.logs.appearance_space import fit_appearance_space
 from jaxslam.logs.log_file import save_log
 from jaxslam.models.sensors import Measurements
 from jaxslam.parameters import default_params
-from jaxslam.results.run_folder import errors
+from jaxslam.results.metrics import compute_errors
 from jaxslam.runs import run
 from jaxslam.simulation.planar import planar
 
-FULL = jnp.array([4, 4, 4])  # slots free for births: beyond the map
+FULL = jnp.array([4, 4, 4])  # free slots: beyond the map
 WITHIN = 0.3  # standard deviation of a landmark's colours, whose centres' is 1
 
 
@@ -125,8 +125,8 @@ def test_hidden_bearings_alone_get_looks_unless_told_otherwise(room):
     assert run.config_for(room, "bearing", descriptors=1).descriptors == 1
     assert run.config_for(planar(length_m=3.0)).descriptors == 0
     with pytest.raises(ValueError, match="3 descriptors are asked for, but 2 tell landmarks"):
-        frames_from_log(room, "bearing", descriptors=3)
-    with pytest.raises(ValueError, match="identities are known, so looks decide nothing"):
+        frames_from_log(room, run.config_for(room, "bearing", descriptors=3))
+    with pytest.raises(ValueError, match="identities are known, so appearance decides nothing"):
         Config(association="known", descriptors=1)
     with pytest.raises(ValueError, match=r"Config\.descriptors: -1 is not a whole number"):
         Config(descriptors=-1)
@@ -200,17 +200,13 @@ def test_a_look_is_the_mean_of_its_sightings_and_ends_with_its_landmark(x64):
     )
     np.testing.assert_allclose(other.mean[:, 2], seen[19, 0])
     assert other.weight[2] == 1 and other.landmark_id[2] == 6
-    # What is new has its look from the first: births take the free slots in order.
+    # New landmarks have an appearance at once, and take the free slots in order.
     frame = measured(seen[0], [0.1, 0.1])
     match, free = jnp.array([NEW, CLUTTER, NEW]), jnp.array([1, 3, 4])
-    born = update_appearances(known, match, match, free, 30, frame)
-    np.testing.assert_allclose(born.mean[:, [1, 3]].T, seen[0, [0, 2]])
-    assert born.weight[1] == born.weight[3] == 1 and born.landmark_id[
-        jnp.array([1, 3])
-    ].tolist() == [
-        90,
-        92,
-    ]
+    updated = update_appearances(known, match, match, free, 30, frame)
+    np.testing.assert_allclose(updated.mean[:, [1, 3]].T, seen[0, [0, 2]])
+    assert updated.weight[1] == updated.weight[3] == 1
+    assert updated.landmark_id[jnp.array([1, 3])].tolist() == [90, 92]
     gone = appearance.clear_slots(known, jnp.array([True, False, True, False]))
     assert gone.weight.tolist() == [0, 5, 0, 0]
     moved = appearance.reorder_slots(known, jnp.array([5, 77, 41, 6]))
@@ -222,12 +218,12 @@ def test_a_look_is_the_mean_of_its_sightings_and_ends_with_its_landmark(x64):
 def test_matches_go_by_place_and_looks_together(x64, spread):
     measurements, scorer, table, valid = case(int(100 * spread), spread)
     config = Config(sensor="bearing", measurements=5, landmarks=7, particles=table.shape[2])
-    alike, new = np.random.default_rng(3).normal(size=(5, 7)), jnp.full(5, -0.02)
+    ratios, new = np.random.default_rng(3).normal(size=(5, 7)), jnp.full(5, -0.02)
     given = measurements, new, -0.5, default_params("bearing")
-    match, _ = associate(config, scorer, *given, None, jnp.asarray(alike))
+    match, _ = associate(config, scorer, *given, None, jnp.asarray(ratios))
     without, _ = associate(config, scorer, *given)
     for i in range(table.shape[2]):
-        expected = greedy(table[:, :, i] + alike, np.full(5, -0.02))
+        expected = greedy(table[:, :, i] + ratios, np.full(5, -0.02))
         expected = np.where(expected < 0, NEW, expected)
         np.testing.assert_array_equal(match[:, i], np.where(valid, expected, PADDING))
     assert (match != without).mean() > 0.2
@@ -243,8 +239,8 @@ def test_a_slot_whose_looks_fit_is_not_passed_over():
     params = default_params()._replace(view_range=5.0)
     given = bounds, jnp.zeros((3, 1)), frame
     assert not select_candidates(config, *given, None, params, 0.0).any()
-    alike = jnp.zeros((1, 64)).at[0, 1].set(12.0)
-    assert np.flatnonzero(select_candidates(config, *given, alike, params, 0.0)).tolist() == [1]
+    ratios = jnp.zeros((1, 64)).at[0, 1].set(12.0)
+    assert np.flatnonzero(select_candidates(config, *given, ratios, params, 0.0)).tolist() == [1]
 
 
 def test_looks_find_lines_that_bearings_alone_confuse(blurred):
@@ -253,7 +249,7 @@ def test_looks_find_lines_that_bearings_alone_confuse(blurred):
     for changes in (dict(descriptors=0), dict()):
         config = run.config_for(blurred, "bearing", **settings, **changes)
         found = run.run(blurred, config, seed=0, refine=False)
-        got = errors(found)
+        got = compute_errors(found)
         right.append(got["association_accuracy"])
         wrong.append(got["landmarks_missed"] + got["landmarks_spurious"])
     assert right[1] > right[0] and wrong[1] < wrong[0] / 2, (right, wrong)

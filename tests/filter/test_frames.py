@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+from jaxslam.config import Config
 from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.log import Log
 from jaxslam.logs.log_file import load_log
@@ -27,6 +28,11 @@ def make(odometry_s, odometry, frame_s, frame=(), **changes):
         "view": (-1.0, 1.0, 5.0),
     }
     return Log(**(values | changes))
+
+
+def frames(log, sensor, params=None, **settings):
+    """Frames of at most three measurements."""
+    return frames_from_log(log, Config(sensor=sensor, **dict(measurements=3) | settings), params)
 
 
 def stamps(seconds):
@@ -69,16 +75,16 @@ def euler(log, steps=200):
     return np.array(out).T
 
 
-def random_log(seed, rows=40, looks=25):
+def random_log(seed, rows=40, count=25):
     rng = np.random.default_rng(seed)
     odometry = np.column_stack([rng.normal(0.3, 0.5, rows), rng.normal(0, 1, rows)])
     odometry[rng.random(rows) < 0.2, 0] = 0  # turning on the spot
     odometry[rng.random(rows) < 0.2, 1] = 0  # straight
     odometry[rng.random(rows) < 0.1] = 0
     times = np.cumsum(rng.uniform(0.02, 0.4, rows))
-    looked = np.sort(rng.uniform(-1, times[-1] + 2, looks))
-    looked[3] = times[10]  # a frame at a stamp of odometry
-    return make(times, odometry, np.sort(looked))
+    frame_s = np.sort(rng.uniform(-1, times[-1] + 2, count))
+    frame_s[3] = times[10]  # a frame at a stamp of odometry
+    return make(times, odometry, np.sort(frame_s))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -165,12 +171,12 @@ def test_thinned_frames_describe_the_same_motion(kind):
     rng = np.random.default_rng(1)
     time_s = np.arange(2000) * 0.015
     odometry = rng.normal(0, 1, (2000, 2)) * (0.3, 0.5)
-    looks = np.sort(rng.choice(time_s, 500, replace=False)) + 0.004
+    frame_s = np.sort(rng.choice(time_s, 500, replace=False)) + 0.004
     start = (3.0, -2.0, 3.0)
-    dense = increments(make(time_s, odometry, looks, odometry_kind=kind))
+    dense = increments(make(time_s, odometry, frame_s, odometry_kind=kind))
     path = dead_reckoning(dense, start)
     for step in (3, 20, 500):
-        few = looks[step - 1 :: step]
+        few = frame_s[step - 1 :: step]
         o = increments(make(time_s, odometry, few, odometry_kind=kind))
         np.testing.assert_allclose(dead_reckoning(o, start), path[step - 1 :: step], atol=1e-10)
         for name in ("distance", "turn", "duration"):
@@ -198,7 +204,7 @@ def test_an_hour_at_full_rate_keeps_every_row():
         np.repeat(np.arange(13_000), 5),
         identity=np.tile(np.arange(5), 13_000),
     )
-    found = frames_from_log(log, "bearing", known=True)
+    found = frames(log, "bearing", association="known", measurements=5)
     assert np.array_equal(found.row.ravel(), np.arange(65_000))
     assert found.dropped == {}
 
@@ -214,7 +220,7 @@ def five(**changes):
 
 
 def test_measurements_are_padded():
-    f = frames_from_log(five(), "range_bearing")
+    f = frames(five(), "range_bearing")
     m = f.measurements
     assert m.value.shape == (3, 3, 2)
     assert m.cov.shape == (3, 3, 3)
@@ -231,7 +237,7 @@ def test_measurements_are_padded():
 
 
 def test_known_identities_are_dense_and_unique():
-    f = frames_from_log(five(), "bearing", known=True)
+    f = frames(five(), "bearing", association="known", measurements=2)
     assert f.identities.tolist() == [10, 20, 40]
     assert f.measurements.identity.tolist() == [[2, 1], [-1, -1], [0, -1]]
     assert f.row.tolist() == [[0, 1], [-1, -1], [4, -1]]
@@ -241,12 +247,12 @@ def test_known_identities_are_dense_and_unique():
 
 
 def test_the_farthest_find_no_slot():
-    f = frames_from_log(five(), "range_bearing", measurements=2)
+    f = frames(five(), "range_bearing", measurements=2)
     assert f.row.tolist() == [[1, 2], [-1, -1], [3, 4]]
     assert f.dropped == {"no measurement slot": 1}
-    f = frames_from_log(five(), "bearing", measurements=2)  # bearings alone: the last
+    f = frames(five(), "bearing", measurements=2)  # bearings alone: the last
     assert f.row.tolist() == [[0, 1], [-1, -1], [3, 4]]
-    f = frames_from_log(five(), "bearing", measurements=7)
+    f = frames(five(), "bearing", measurements=7)
     assert f.row.shape == (3, 7)
     assert f.dropped == {}
 
@@ -257,7 +263,7 @@ def numbers(**changes):
 
 def test_positions_made_of_range_and_bearing():
     params = numbers(sigma_range=0.1, sigma_bearing=0.02, landmark_extent=0.03)
-    m = frames_from_log(five(), "position", params=params).measurements
+    m = frames(five(), "position", params=params).measurements
     r, b = 2.0, 0.3
     place = m.value[0, 2]
     assert place == pytest.approx((r * np.cos(b), r * np.sin(b)))
@@ -269,17 +275,17 @@ def test_positions_made_of_range_and_bearing():
 
 
 def test_noise_of_made_positions_is_the_declared_one():
-    declared = frames_from_log(
+    declared = frames(
         five(noise={"sigma_range": 0.4, "landmark_extent": 0.0}), "position"
     ).measurements
     given = numbers(sigma_range=0.4, sigma_bearing=default_params("position").sigma_bearing)
-    same = frames_from_log(five(), "position", params=given).measurements
+    same = frames(five(), "position", params=given).measurements
     assert declared.cov == pytest.approx(same.cov)
 
 
 def test_positions_of_the_log_itself_come_first():
     points, covs = np.arange(10.0).reshape(5, 2) + 1, [[1, 0.5, 2]] * 5
-    f = frames_from_log(five(point=points, point_cov=covs), "position", measurements=2)
+    f = frames(five(point=points, point_cov=covs), "position", measurements=2)
     assert f.measurements.value[0].tolist() == [[1, 2], [3, 4]]  # the nearest two
     assert f.measurements.cov[2, 1].tolist() == [1, 0.5, 2]
 
@@ -289,39 +295,39 @@ def test_bearings_without_a_point_are_no_positions_and_nothing_lost():
     points, covs = np.arange(10.0).reshape(5, 2) + 1, np.tile([1, 0.5, 2], (5, 1))
     points[[1, 3]], covs[[1, 3]] = nan, nan
     log = five(point=points, point_cov=covs, point_baseline=[0.2, nan, nan, nan, 0.3])
-    f = frames_from_log(log, "position")
+    f = frames(log, "position")
     assert f.row[f.row >= 0].tolist() == [0, 2, 4]
     assert np.isfinite(f.measurements.value).all()
     assert np.isfinite(f.measurements.cov).all()
     assert f.measurements.scale[f.row >= 0].tolist() == [1, 0, 1]
     assert not f.measurements.scale[f.row < 0].any()
     assert f.dropped == {}
-    assert frames_from_log(log, "bearing").measurements.scale is None
-    known = frames_from_log(log, "position", known=True)
+    assert frames(log, "bearing").measurements.scale is None
+    known = frames(log, "position", association="known")
     identified = [row for row in (0, 2, 4) if log.identity[row] >= 0]
     assert known.dropped.get("no identity", 0) == 3 - len(identified)
 
 
 def test_where_no_row_has_a_point_positions_are_made_of_ranges():
     gaps = {"point": np.full((5, 2), np.nan), "point_cov": np.full((5, 3), np.nan)}
-    made = frames_from_log(five(**gaps), "position").measurements
-    assert made.value == pytest.approx(frames_from_log(five(), "position").measurements.value)
+    made = frames(five(**gaps), "position").measurements
+    assert made.value == pytest.approx(frames(five(), "position").measurements.value)
 
 
 def test_no_measurements_at_all():
-    f = frames_from_log(make([0, 1], [[1, 0]] * 2, [1.0, 2.0]), "range_bearing")
+    f = frames(make([0, 1], [[1, 0]] * 2, [1.0, 2.0]), "range_bearing", measurements=1)
     assert f.row.tolist() == [[-1], [-1]]
     assert f.measurements.value.shape == (2, 1, 2)
     log = make([0, 1], [[1, 0]] * 2, [1.0], identity=np.empty(0, int))
-    assert frames_from_log(log, "bearing", known=True).identities.tolist() == []
+    assert frames(log, "bearing", association="known").identities.tolist() == []
 
 
 def test_wrong_requests_say_what_the_log_has():
     log = five(range=None, identity=None)
     with pytest.raises(ValueError, match="'range_bearing' is not in this log; it has bearing"):
-        frames_from_log(log, "range_bearing")
+        frames(log, "range_bearing")
     with pytest.raises(ValueError, match="'sonar'"):
-        frames_from_log(log, "sonar")
+        frames(log, "sonar")
     for identity in (None, [-1] * 5):
         with pytest.raises(ValueError, match="needs identities"):
-            frames_from_log(five(identity=identity), "bearing", known=True)
+            frames(five(identity=identity), "bearing", association="known")

@@ -110,14 +110,14 @@ def test_a_bearing_landmark_stays_with_the_exact_posterior(ahead):
     zero = jnp.zeros(draws)
     mean, factor, anchor = sensors.locate("bearing", (zero, zero, zero), (first, 0.0), None, params)
 
-    def look(state, seen):
+    def update(state, seen):
         at, value = seen
         pose = (zero + at, zero, zero)
         after = landmarks.update("bearing", pose, *state, anchor, (value, 0.0), None, params)
         return after[:2], after[2]
 
     given = jnp.asarray(x, jnp.float32), jnp.asarray(values, jnp.float32)
-    (mean, factor), _ = jax.jit(lambda s, g: jax.lax.scan(look, s, g))((mean, factor), given)
+    (mean, factor), _ = jax.jit(lambda s, g: jax.lax.scan(update, s, g))((mean, factor), given)
     cov = np.moveaxis(matrix(np.asarray(geometry.covariance(factor), float)), -1, 0)
     nees = []
     for i in range(draws):

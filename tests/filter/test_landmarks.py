@@ -209,7 +209,7 @@ def test_existence_by_hand(x64):
         (-4, 2.0, 2.0, 0.0, 2.5, -4),  # matched
         (-4, 2.0, 9.0, 3.0, 2.5, -4),  # wherever it was expected
         (-4, 3.8, 2.0, 0.0, 4.0, -4),  # up to a limit
-        (-1, 0.5, 2.0, 0.0, 1.0, -1),  # born in this frame: nothing is taken off
+        (-1, 0.5, 2.0, 0.0, 1.0, -1),  # begun in this frame: nothing is subtracted
         (3, 0.1, 0.5, 0.0, 0.1 + 0.1 * log1p(-0.9 * 0.9375), 0),  # below zero: freed
         (3, 0.3, 0.5, 0.0, 0.3 + 0.1 * log1p(-0.9 * 0.9375), 3),
         (0, -1.0, 2.0, 0.0, -1.0, 0),  # an empty slot is not freed again
@@ -250,7 +250,7 @@ def test_a_given_map_fills_the_first_slots_of_every_particle(x64, sensor):
         np.testing.assert_array_equal(world.mean[:, :2, n], given[0])
         np.testing.assert_array_equal(world.factor[:, :2, n], given[1])
         np.testing.assert_array_equal(world.count[:, n], [1, 1, 0, 0])
-        # No birth of a frame, nor NEW, CLUTTER or PADDING.
+        # No id of a frame, nor NEW, CLUTTER or PADDING.
         np.testing.assert_array_equal(world.landmark_id[:2, n], [-4, -5])
         if sensor == "bearing":
             np.testing.assert_array_equal(world.anchor[:, :2, n], given[2])

@@ -68,11 +68,9 @@ def test_chains_give_what_copying_at_once_gives():
 
 
 def driven(config, log):
-    """Final settled state and every step's `Info`."""
+    """Final state, all resampled, and every step's `Info`."""
     params = default_params(config.sensor, log)
-    data = frames_from_log(
-        log, config.sensor, config.measurements, params, config.association == "known"
-    )
+    data = frames_from_log(log, config, params)
     numbers = jax.tree.map(
         lambda v: jnp.asarray(v, jnp.float32) if np.asarray(v).dtype.kind == "f" else v,
         (data.odometry, data.measurements, Params(*map(np.asarray, params))),

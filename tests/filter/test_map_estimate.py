@@ -39,7 +39,7 @@ def test_points_in_the_world_are_what_they_are(x64, sensor):
 
 
 def brute_force(sensor, world, weight, landmark_id):
-    """Mean and covariance of the mixture of all particles' landmarks of this birth."""
+    """Mean and covariance of the mixture of all particles' landmarks of this id."""
     point, cov, known = (np.asarray(v) for v in map_estimate.to_world(sensor, world))
     shares, means, covs = [], [], []
     for m, n in np.argwhere(np.asarray(world.landmark_id) == landmark_id):
@@ -60,7 +60,7 @@ def test_the_summary_is_the_mixture_over_the_particles(x64, sensor):
     count = rng.integers(0, 4, (slots, particles))
     count[:, best] = [2, 1, 0, 3, 1]
     world = world_of(sensor, count)
-    # The same births, in each particle in other slots; some in none, some emptied.
+    # The same landmarks, in each particle in other slots; some in none, some emptied.
     landmark_id = np.array([rng.permutation([3, 14, 15, 92, 65]) for _ in range(particles)]).T
     log_odds = np.full(count.shape, 9.0)
     log_odds[3, best] = 4.9  # not confirmed yet

@@ -170,8 +170,8 @@ def drive_among_marks(sensor, steps=5):
     full = np.full(steps, 1.0)
     odometry = Odometry(ahead, 0 * full, turn, ahead, turn, full, full / 2, full / 12)
     params = default_params(sensor)._replace(
-        err_tran=0.15, err_rot=0.2, err_drift=0.1, sigma_bearing=0.04, landmark_extent=0.0, sigma_range=0.1,
-        correlation=0.0, extra_bearing_noise=0.0,
+        err_tran=0.15, err_rot=0.2, err_drift=0.1, sigma_bearing=0.04, landmark_extent=0.0,
+        sigma_range=0.1, correlation=0.0, extra_bearing_noise=0.0,
     )  # fmt: skip
     pose, values = np.zeros(3), []
     for t in range(steps):

@@ -313,7 +313,7 @@ def test_a_run_is_the_same_whoever_shares_it():
 
 
 def test_a_setting_that_an_earlier_version_did_not_have_counts_as_its_default():
-    """A run of that version, put aside, is no run with looks; it is gone on with without."""
+    """A checkpoint of that version is of a run without descriptors, and is resumed so."""
     before = {"config": {"particles": 20}}
     with_looks, without = ({"config": {"particles": 20, "descriptors": n}} for n in (6, 0))
     assert cluster.find_differences(before, with_looks) == "descriptors (0, now 6)"

@@ -30,7 +30,7 @@ def log():
 def setup(log, sensor="range_bearing", **settings):
     config = config_for(log, sensor, particles=PARTICLES, landmarks=30, block=8, **settings)
     params = default_params(sensor, log)
-    data = frames_from_log(log, sensor, config.measurements, params, config.association == "known")
+    data = frames_from_log(log, config, params)
     real = jnp.zeros(()).dtype
     data = jax.tree.map(
         lambda leaf: jnp.asarray(
@@ -96,7 +96,7 @@ def test_a_moved_or_mirrored_world_gives_the_answer_moved_or_mirrored(x64, log, 
     state, info = drive(config, params, data, chance)
     assert info.resampled.sum() > 3
     assert (info.log_choice.min() < -0.1) == (settings == DRAWN)
-    # Without a look informed particles, too, are drawn from the motion model.
+    # Without measurements informed particles, too, are drawn from the motion model.
     before = info.pose[BLIND - 1][:, info.ancestors[BLIND - 1]]
     odometry = jax.tree.map(lambda leaf: leaf[BLIND], data[0])
     expected = jnp.stack(motion.sample(before, odometry, params, chance.normals[BLIND]))

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import score_estimators
 from test_proposal import ODOMETRY, drive_among_marks
 
 from jaxslam.config import Config
@@ -23,7 +24,7 @@ KEY = jax.random.key(4)
 FAST = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # compiling
 forward = jax.jit(
     likelihood.score_and_value.__wrapped__,
-    static_argnames=("config", "names", "estimator"),
+    static_argnames=("config", "names"),
     compiler_options=FAST,
 )
 
@@ -88,7 +89,9 @@ def backwards(params, data, config, names, discount):
             seen = blocks.observe(state, chance, *frame, given, config, True)
             drawn = motion.log_density(hold(seen.pose), hold(state.pose), frame[0], given)
             own = discount * inherited + seen.density + drawn
-            after, info = fastslam.conclude(chance, *hold((state, seen)), frame[1], config)
+            after, info = fastslam.weigh_and_resample(
+                chance, *hold((state, seen)), frame[1], config
+            )
             before, weight = hold((jnp.exp(state.log_weight), jnp.exp(info.log_weight)))
             gain = own @ weight - discount * inherited @ before
             common = likelihood.frame_terms(frame[1], given)
@@ -190,7 +193,8 @@ def test_grad_by_one_parameter(x64, scored, name):
 def test_plain_is_what_differentiation_of_the_value_gives(x64, scored, monkeypatch):
     log, params, config, *_ = scored
     data, names = likelihood.data_from_log(log, config), ("err_tran", "sigma_bearing", "outlier")
-    found = forward(numbers(params), data, KEY, config, names, "plain")
+    plain = quick(lambda p: score_estimators.score(p, data, KEY, config, names, "plain"))
+    found = plain(numbers(params))
     choose = resampling.systematic  # has no derivative at all
     monkeypatch.setattr(
         resampling, "systematic", lambda *chances: choose(*jax.lax.stop_gradient(chances))
@@ -279,7 +283,7 @@ def test_what_is_refused():
     with pytest.raises(ValueError, match="'outlier' can't be learnt"):
         likelihood.score(params, log, KEY, certain, ("outlier",))
     with pytest.raises(ValueError, match="estimator: 'score' is not one of fisher, pathwise, pla"):
-        likelihood.log_likelihood(params, log, KEY, config, "score")
+        score_estimators.score(params, log, KEY, config, (), "score")
     with pytest.raises(ValueError, match="has 6 frames, more than the 5 asked for"):
         likelihood.data_from_log(log, config, steps=5)
 
@@ -296,7 +300,7 @@ def test_the_mean_score_is_that_of_particles_that_are_never_resampled(x64, senso
 
     def runs(config, estimator, count):
         def one(key):
-            found = likelihood.score_and_value(params, data, key, config, names, estimator, 1.0)
+            found = score_estimators.score(params, data, key, config, names, estimator, 1.0)
             return found.log_likelihood, found.total, found.min_ess
 
         keys = jax.random.split(jax.random.key(3), count)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import score_estimators
 import test_exact
 from test_proposal import enumerated
 
@@ -95,9 +96,7 @@ def off_by(oracle, proposal, estimator, runs, association="sampled"):
 
     def one(key):
         # Not the jitted function, whose trace may be from before something was replaced.
-        found = likelihood.score_and_value.__wrapped__(
-            params, data, key, config, NAMES, estimator, 1.0
-        )
+        found = score_estimators.score(params, data, key, config, NAMES, estimator, 1.0)
         return found.log_likelihood, found.total, found.min_ess
 
     many = jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=2000))

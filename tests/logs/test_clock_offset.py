@@ -38,7 +38,7 @@ def test_of_very_many_bearings_some_are_enough(room):
         room, frame=frame, bearing=bearing, range=None, identity=None, truth=None
     )
     pairs = clock_offset._pairs(crowd)
-    assert max(len(part.apart) for part in pairs) <= clock_offset.ENOUGH + 300**2
+    assert max(len(part.difference) for part in pairs) <= clock_offset.MAX_DIFFERENCES + 300**2
     assert clock_offset.estimate_clock_offset(crowd) is None  # among so many something always fits
 
 

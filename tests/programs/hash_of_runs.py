@@ -1,4 +1,4 @@
-"""Print a digest of what runs find: LOG SETTINGS CHANGES (JSON)."""
+"""Print a digest of results of runs: LOG SETTINGS CHANGES (JSON)."""
 
 import hashlib
 import json
@@ -20,23 +20,23 @@ for change in json.loads(sys.argv[3]):
     compiled.CHUNK = change.pop("chunk", 256)
     runs, folder = change.pop("runs", 0), change.pop("save", None)
     config = config_for(log, **settings | change)
-    if runs:  # three of them, shared by so many devices; the first is looked at
-        todo = batch.plan_tasks("3,5,6", default_params(config.sensor, log))
-        found = batch.run_tasks(log, config, todo, refine=False, devices=runs)[0]
+    if runs:  # three of them, on so many devices; the digest is of the first
+        tasks = batch.plan_tasks("3,5,6", default_params(config.sensor, log))
+        result = batch.run_tasks(log, config, tasks, refine=False, devices=runs)[0]
     else:
-        found = run.run(log, config, seed=3, refine=False)
+        result = run.run(log, config, seed=3, refine=False)
     if folder:
-        run_folder.save(found, folder, figures=False)
+        run_folder.save(result, folder, figures=False)
     names = "pose", "cov", "log_evidence", "ess", "match", "landmarks", "ancestral", "lineage"
     digest = hashlib.sha256()
-    for leaf in jax.tree.leaves([getattr(found, name) for name in names]):
+    for leaf in jax.tree.leaves([getattr(result, name) for name in names]):
         digest.update(np.ascontiguousarray(leaf).tobytes())
     print(
         digest.hexdigest(),
-        found.resampled.sum(),
-        len(found.landmarks.id),
-        len(found.pose),
+        result.resampled.sum(),
+        len(result.landmarks.id),
+        len(result.pose),
         config.devices,
-        f"{found.seconds:.1f} s + {found.compile_seconds:.1f} s",
+        f"{result.seconds:.1f} s + {result.compile_seconds:.1f} s",
         flush=True,
     )

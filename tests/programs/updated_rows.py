@@ -1,4 +1,4 @@
-"""Check rows read through ancestors on four devices, for every AMOUNT they moved by."""
+"""Check rows resampled lazily on four devices, with ancestors shifted by every AMOUNT."""
 
 import sys
 from functools import partial
@@ -27,21 +27,21 @@ behind = rng.integers(-1, 2, 24).astype("i")
 for amount in map(int, sys.argv[1:]):
     chains = np.arange(160) + amount + rng.integers(-2, 3, (2, 160))
     chains = np.sort(np.clip(chains, 0, 159), -1).astype("i")
-    past = lazy_resampling.empty_ancestry(config)._replace(
+    ancestry = lazy_resampling.empty_ancestry(config)._replace(
         chains=jnp.asarray(chains), chain=jnp.asarray(behind)
     )
     wanted = rng.uniform(size=24) < 0.8
-    found, after = sharding.shard_map(
+    updated, updated_ancestry = sharding.shard_map(
         partial(lazy_resampling.apply_ancestry, config=config),
-        (sharding.particle_sharded(world), sharding.replicated(past), sharding.ALL),
-        (sharding.particle_sharded(world), sharding.replicated(past)),
+        (sharding.particle_sharded(world), sharding.replicated(ancestry), sharding.ALL),
+        (sharding.particle_sharded(world), sharding.replicated(ancestry)),
         config,
-    )(jax.tree.map(jnp.asarray, world), past, jnp.asarray(wanted))
+    )(jax.tree.map(jnp.asarray, world), ancestry, jnp.asarray(wanted))
     due = wanted & (behind >= 0)
-    for one, leaf in zip(jax.tree.leaves(world), jax.tree.leaves(found), strict=True):
-        expected = one.copy()
+    for before, leaf in zip(jax.tree.leaves(world), jax.tree.leaves(updated), strict=True):
+        expected = before.copy()
         for slot in np.flatnonzero(due):
-            expected[..., slot, :] = one[..., slot, chains[behind[slot]]]
+            expected[..., slot, :] = before[..., slot, chains[behind[slot]]]
         np.testing.assert_array_equal(leaf, expected)
-    assert (np.asarray(after.chain) == np.where(due, -1, behind)).all()
-    print(bool(halo_exchange.suffices(past.chains, config).all()), int(due.sum()))
+    assert (np.asarray(updated_ancestry.chain) == np.where(due, -1, behind)).all()
+    print(bool(halo_exchange.suffices(ancestry.chains, config).all()), int(due.sum()))

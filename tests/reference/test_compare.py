@@ -11,7 +11,8 @@ from jaxslam.config import SENSORS, Config
 from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.log_file import load_log
 from jaxslam.parameters import default_params
-from jaxslam.reference import compare, fastslam, variants
+from jaxslam.reference import compare, fastslam
+from jaxslam.runs.run import config_for
 from jaxslam.simulation import planar
 
 STEPS, PARTICLES = 200, 20
@@ -38,8 +39,8 @@ def assert_agree(log, config):
     assert found.same == found.steps == STEPS
     assert max(found.pose, found.log_weight, found.landmarks) <= 1e-9
     assert found.resampled >= 10
-    assert found.born >= 5
-    assert found.freed >= 1 or not config.forgetting
+    assert found.begun >= 5
+    assert found.forgotten >= 1 or not config.forgetting
     assert jnp.ones(1).dtype == jnp.float32  # float64 was not left switched on
     return found
 
@@ -53,7 +54,7 @@ def test_baseline_and_filter_agree(woods, sensor, association):
 
 
 def test_baseline_and_filter_agree_on_points_that_rest_on_odometry(woods):
-    f = frames_from_log(woods, "position", params=default_params("position", woods))
+    f = frames_from_log(woods, config_for(woods, "position"))
     cov = np.full((len(woods.frame), 3), np.nan)
     point, base = cov[:, :2].copy(), cov[:, 0].copy()
     rows = f.row[f.row >= 0]
@@ -70,7 +71,7 @@ def test_baseline_and_filter_agree_on_points_that_rest_on_odometry(woods):
 
 def test_baseline_and_filter_agree_on_the_papers_rules(woods):
     found = assert_agree(woods, Config.paper(**SIZES))
-    assert found.freed == found.clutter == 0
+    assert found.forgotten == found.clutter == 0
 
 
 def small(steps=12):
@@ -120,47 +121,11 @@ def test_the_baselines_map_is_what_its_best_particle_is_sure_of():
     def found(sensor, **rules):
         config = Config(sensor=sensor, **rules)
         given = reference, params, config, np.array([40, 41, 42]), np.array([10.0, 20, 0])
-        return [column.tolist() for column in compare._baseline_map(*given)]
+        return [column.tolist() for column in compare._map_of_best(*given)]
 
     assert found("position") == [[[10.0, 20.5], [10.0, 20.5]], [40, -1]]
     assert len(found("position", forgetting=False)[0]) == 3
     assert found("bearing") == [[[13.0, 21.0]], [40]]  # 2 m from its anchor; the last: no depth
-
-
-def test_variants_stand_side_by_side():
-    log = planar.planar("field", 5, landmarks=15, length_m=12.0, rate_hz=2.0)
-    config = Config(particles=30, measurements=10, landmarks=30)  # test_offline's: compiled once
-    pose, marks = log.truth.pose[:40] + [0.25, 0, 0], log.truth.landmarks[:9]
-    world = compare.PointMap(marks + [0.25, 0.1], np.full(9, -1))
-    zeros = [0.0] * 4
-    slow = compare.Agreement(40, 5, 40, *zeros[:3], 1, *zeros, pose, pose, 8.0, 0.1, 0.3, world)
-    baselines = [compare.Comparison(slow, slow, 0.25, 0.25)]
-    rows = variants.variants(log, config, None, 0, 40, 1, baselines)
-    names = ["baseline, NumPy", "Config.paper()", "FastSLAM 1.0", "informed", "refined"]
-    assert [row.name for row in rows] == names
-    assert [row.particles for row in rows] == [5, 30, 30, 30, 30]
-    found = (0, 0.25, 0.1, 0.2)  # m and s
-    assert rows[0][2:5] + rows[0][6:] == pytest.approx(found, abs=1e-6)
-    assert rows[0].counts == (9, 6, 0)
-    for row in rows[1:]:
-        assert 0 < row.aligned < row.unaligned < 0.5
-        assert 0 < row.landmarks < 0.5
-        matched, missed, _ = row.counts
-        assert matched > 5 and matched + missed == len(log.truth.landmarks)
-    assert rows[-1].unaligned < rows[2].unaligned
-    assert rows[-1].seconds > rows[-2].seconds  # with what was spent before
-    lines = variants.table(rows).splitlines()
-    assert [line[:16].strip() for line in lines[1:]] == names
-    assert "0.250 m" in lines[1] and "9/6/0" in lines[1] and "200 ms" in lines[1]
-
-
-def test_variants_without_truth_have_times_only():
-    log = small()[0]
-    pose = np.zeros((len(log.frame_time), 3))
-    world = compare.PointMap(np.ones((2, 2)), np.array([-1, -1]))
-    row = variants._measured("x", replace(log, truth=None), 7, pose, world, 3.0 * len(pose))
-    assert np.isnan([row.aligned, row.unaligned, row.landmarks]).all()
-    assert " ".join(variants.table([row]).splitlines()[1].split()) == "x 7 - - - - 3000 ms"
 
 
 def traces(steps=3, particles=2):

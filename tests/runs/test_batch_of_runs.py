@@ -9,7 +9,8 @@ from jaxslam.cli import main as cli
 from jaxslam.logs.log_file import load_log
 from jaxslam.logs.slicing import cut
 from jaxslam.parameters import default_params
-from jaxslam.runs import batch, compiled, run
+from jaxslam.results.load import load_result
+from jaxslam.runs import batch, compiled, memory, run
 
 CONFIG = dict(particles=30, landmarks=30, measurements=10)  # test_offline's: compiled once
 
@@ -24,20 +25,20 @@ def three(woods):
     """Three tasks, worked off in programs of two, and their results."""
     config = run.config_for(woods, "range_bearing", **CONFIG)
     todo = batch.plan_tasks("1,4", default_params("range_bearing", woods), ["err_rot=0.05,0.2"])[:3]
-    before, batch.BYTES = batch.BYTES, 2 * state_bytes(config)
+    before, batch.STATE_BYTES = batch.STATE_BYTES, 2 * state_bytes(config)
     try:
         return config, todo, batch.run_tasks(woods, config, todo, refine=False)
     finally:
-        batch.BYTES = before
+        batch.STATE_BYTES = before
 
 
 def state_bytes(config):
-    return batch.capacity.of_arrays(compiled.state_shapes(config))
+    return memory.bytes_of(compiled.state_shapes(config))
 
 
 def test_each_run_is_bit_for_bit_what_it_is_alone(woods, three):
     config, todo, results = three
-    assert [(task.seed, task.told) for task in todo] == [
+    assert [(task.seed, task.swept) for task in todo] == [
         (1, {"err_rot": 0.05}), (4, {"err_rot": 0.05}), (1, {"err_rot": 0.2}),
     ]  # fmt: skip
     assert len(results) == 3
@@ -54,7 +55,7 @@ def test_each_run_is_bit_for_bit_what_it_is_alone(woods, three):
 def test_the_table_has_a_line_for_each_run_and_its_mean_and_spread(three):
     _, todo, results = three
     found = batch.summary_rows(todo, results)
-    lines = batch.table(found).splitlines()
+    lines = batch.format_runs(found).splitlines()
     assert [line.split()[0] for line in lines] == ["seed", "1", "4", "mean", "sd", "1"]
     evidence = [row["log_likelihood"] for row in found[:2]]
     assert float(lines[3].split()[2]) == pytest.approx(np.mean(evidence), abs=0.06)
@@ -67,7 +68,7 @@ def test_saved_are_the_table_and_each_runs_folder(three, woods, tmp_path):
     with open(tmp_path / "all" / "runs.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [row["err_rot"] for row in rows] == ["0.05", "0.05", "0.2"]
-    again = batch.report.load(tmp_path / "all" / "seed-4-err_rot-0.05")
+    again = load_result(tmp_path / "all" / "seed-4-err_rot-0.05")
     np.testing.assert_array_equal(again.pose, results[1].pose)
     with pytest.raises(ValueError, match="exists; choose another"):
         batch.save(todo, results, tmp_path / "all")

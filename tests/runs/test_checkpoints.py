@@ -1,5 +1,6 @@
 """Long runs: what is put aside is gone on with bit for bit, and nothing is lost on the way."""
 
+import dataclasses
 import errno
 import io
 import os
@@ -49,7 +50,7 @@ def same(a, b):
 
 def columns(result):
     """All that a run found, but for times."""
-    found = {name: getattr(result, name) for name in run_folder.COLUMNS}
+    found = {f.name: getattr(result, f.name) for f in dataclasses.fields(result) if f.metadata}
     return found | {n: getattr(result, n) for n in ("landmarks", "ancestral", "lineage")}
 
 
@@ -133,7 +134,7 @@ def test_a_broken_checkpoint_is_said_and_the_one_before_it_taken(log, tmp_path, 
         newest.write_bytes(damaged)
         said = []
         with pytest.raises(Stop), offline.Checkpoints(folder, 0, True, say=said.append) as places:
-            places.begin(log, config, default_params(config.sensor, log), 3)
+            places.check_fingerprint(log, config, default_params(config.sensor, log), 3)
             assert places.restore(compiled.state_shapes(config)).done == 7
             raise Stop
         assert sum(line.startswith("warning: a broken checkpoint is left aside: ") for line in said)
@@ -226,10 +227,10 @@ def test_a_full_disk_leaves_the_old_checkpoint_and_an_exit_code(there, call, mon
 
 
 def test_at_most_two_are_kept_and_none_in_the_end(there, call, monkeypatch):
-    counts, tell = [], offline._stderr
+    counts, tell = [], offline._print_to_stderr
     monkeypatch.setattr(
         offline,
-        "_stderr",
+        "_print_to_stderr",
         lambda line: (counts.append(len(os.listdir("out/checkpoints"))), tell(line)),
     )
     code, _, err = call(*LONG)

@@ -10,7 +10,7 @@ from jaxslam.logs.log_file import save_log
 from jaxslam.logs.slicing import cut
 from jaxslam.parameters import default_params
 from jaxslam.results import load
-from jaxslam.runs import batch, checkpoints, run
+from jaxslam.runs import batch, checkpoint_file, checkpoints, run
 from jaxslam.simulation.planar import planar
 from jaxslam.smoother import reassociation, refine
 
@@ -42,10 +42,11 @@ def test_what_was_filtered_outlives_a_refinement_that_fails(log, call, monkeypat
 def test_where_they_are_too_many_landmarks_seen_once_are_left_out(log, monkeypatch):
     config = run.config_for(log, "range_bearing", particles=30, landmarks=30)
     whole = run.run(log, config)
-    of, label = np.array([0, 2, -1, 2, 1, 0]), np.array([7, 8, 9])
-    fewer = refine._reobserve(reassociation.Groups(of, label, np.arange(6.0).reshape(3, 2)))
-    np.testing.assert_array_equal(fewer.of, [0, 1, -1, 1, -1, 0])
-    np.testing.assert_array_equal(fewer.label, [7, 9])
+    assignment, ids = np.array([0, 2, -1, 2, 1, 0]), np.array([7, 8, 9])
+    groups = reassociation.Groups(assignment, ids, np.arange(6.0).reshape(3, 2))
+    fewer = refine._drop_single_measurements(groups)
+    np.testing.assert_array_equal(fewer.assignment, [0, 1, -1, 1, -1, 0])
+    np.testing.assert_array_equal(fewer.landmark_id, [7, 9])
     np.testing.assert_array_equal(fewer.point, [[0, 1], [4, 5]])
     monkeypatch.setattr(refine, "LARGE", 0)
     few = run.run(log, config)
@@ -64,7 +65,7 @@ def test_values_of_a_sweep_have_folders_of_their_own(log):
     params = default_params("range_bearing", log)
     todo = batch.plan_tasks("3", params, ["gain_rot=1.0000001,1.0000002,1.0000001"])
     assert len(todo) == 2
-    names = [batch._short(task.told["gain_rot"]) for task in todo]
+    names = [batch._short(task.swept["gain_rot"]) for task in todo]
     assert names == ["1.0000001", "1.0000002"]
     assert batch._short(0.1) == "0.1"
 
@@ -97,13 +98,13 @@ def test_a_finished_run_is_not_that_of_another_log(log, call, refuse):
 
 
 def test_a_signal_during_the_last_checkpoint_stops_the_run(log, monkeypatch):
-    write = checkpoints.checkpoint.write
+    write = checkpoint_file.write_checkpoint
 
     def signalled(*given):
         write(*given)
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(checkpoints.checkpoint, "write", signalled)
+    monkeypatch.setattr(checkpoint_file, "write_checkpoint", signalled)
     config = run.config_for(log, "range_bearing", particles=30, landmarks=30)
     with pytest.raises(KeyboardInterrupt, match="--resume"), checkpoints.Checkpoints("out") as kept:
         run.run(log, config, None, 0, None, True, kept)

@@ -100,7 +100,7 @@ def test_landmarks_without_a_depth_stay_out_of_the_map():
         count=world.count.at[2].set(0), landmark_id=jnp.array([[7, 7], [8, 8], [9, 9]], jnp.int32)
     )
     params = default_params("bearing")
-    found = assemble._map(
+    found = assemble._estimate_map(
         state._replace(landmarks=world), 0, params, config, np.empty(0, int), np.array([5.0, 0, 0])
     )
     np.testing.assert_array_equal(found.id, [7])

@@ -8,14 +8,14 @@ import pytest
 
 from jaxslam.simulation.room import render
 from jaxslam.simulation.room.furniture import furnish
-from jaxslam.simulation.room.geometry import eye_at, look, visible_edges
-from jaxslam.simulation.room.raycast import camera_rays, cast, expose, scene
+from jaxslam.simulation.room.geometry import eye_at, trace_rays, visible_edges
+from jaxslam.simulation.room.raycast import build_scene, camera_rays, cast, expose
 from jaxslam.simulation.room.render import (
     PRESETS,
     Effects,
     double_mirror_camera,
-    frames,
-    nominal,
+    nominal_camera,
+    render_frames,
     render_room,
 )
 from jaxslam.simulation.room.trajectory import Drive, stop_and_go
@@ -62,14 +62,14 @@ def folder(tmp_path_factory):
 
 def test_rays_meet_what_plain_ray_casting_meets(world, camera):
     """The sorted sectors against every ray on every surface; eye above the low furniture too."""
-    rays, built = camera_rays(camera, samples=1), scene(world)
+    rays, built = camera_rays(camera, samples=1), build_scene(world)
     rng = np.random.default_rng(0)
     some = np.sort(rng.choice(len(rays.azimuth), 3000, replace=False))
     for pose, height in (((1.0, 1.0, 0.3), 0.6), ((8.0, 3.0, -2.5), 1.5), ((5.2, 1.2, 3.1), 0.6)):
         eye = eye_at(pose, (0.03, 0.02, height))
         found = cast(built, rays, eye, pose[2])[some, :3] / 255
         elevation = np.arctan(rays.slope[some])
-        _, colour = look(world, eye, rays.azimuth[some] + pose[2], elevation)
+        _, colour = trace_rays(world, eye, rays.azimuth[some] + pose[2], elevation)
         off = np.abs(found - colour).max(1) > 0.02
         assert off.mean() < 0.005  # single precision, at borders of the paint
 
@@ -95,7 +95,7 @@ def edge_errors(image, camera, view):
 
 
 def test_edges_are_where_the_geometry_says(world, camera):
-    rays, built, errors = camera_rays(camera), scene(world), []
+    rays, built, errors = camera_rays(camera), build_scene(world), []
     for pose in stop_and_go(seed=1, length=20.0).pose[::7]:
         image = expose(built, rays, eye_at(pose, camera.position), pose[2])
         errors += edge_errors(image, camera, visible_edges(world, pose, camera.position))
@@ -124,7 +124,7 @@ def test_the_camera_sees_from_minus_5_to_65_degrees(camera):
 
 
 def test_nominal_is_another_camera(camera):
-    assumed = nominal(camera)
+    assumed = nominal_camera(camera)
     assert assumed.roll == assumed.pitch == assumed["p1"] == assumed["e"] == 0
     assert (assumed["cx"], assumed["cy"], assumed["c"]) == (319.5, 239.5, 1)
     azimuth = np.linspace(-3, 3, 50)
@@ -133,7 +133,7 @@ def test_nominal_is_another_camera(camera):
     off = np.degrees(np.arctan2(seen[:, 1], seen[:, 0]) - azimuth)
     assert 0.5 < np.sqrt(np.mean(off**2)) < 3
     straight = double_mirror_camera(0.0)
-    np.testing.assert_allclose(straight.params, nominal(straight).params, atol=1e-12)
+    np.testing.assert_allclose(straight.params, nominal_camera(straight).params, atol=1e-12)
 
 
 def test_effects(world, camera):
@@ -142,7 +142,9 @@ def test_effects(world, camera):
     def shoot(effects):
         return [
             image.astype(float)
-            for image, _, _ in frames(world, camera, Drive(pose, still), effects, 5, samples=2)
+            for image, _, _ in render_frames(
+                world, camera, Drive(pose, still), effects, 5, samples=2
+            )
         ]
 
     clean, again = shoot(PRESETS["clean"])

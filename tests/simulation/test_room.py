@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxslam.simulation.room.furniture import furnish
-from jaxslam.simulation.room.geometry import HEIGHT, VIEW, eye_at, look, visible_edges
+from jaxslam.simulation.room.geometry import HEIGHT, VIEW, eye_at, trace_rays, visible_edges
 from jaxslam.simulation.room.trajectory import RADIUS, stop_and_go
 
 POSITION = (0.05, -0.02, 0.6)
@@ -84,7 +84,7 @@ def test_look_meets_the_nearest_thing(rooms):
     world, rng = rooms[2], np.random.default_rng(2)
     eye = np.array([2.0, 1.0, 1.4])  # above the low furniture: its tops are seen too
     azimuth, elevation = rng.uniform(-np.pi, np.pi, 200), rng.uniform(*VIEW, 200)
-    distance, colour = look(world, eye, azimuth, elevation)
+    distance, colour = trace_rays(world, eye, azimuth, elevation)
     plain = [nearest_hit(world, eye, a, e) for a, e in zip(azimuth, elevation, strict=True)]
     # tops are not among the vertical rectangles, and stop a ray before its next hit
     assert np.mean(np.abs(distance - plain) < 1e-9) > 0.95

@@ -12,6 +12,7 @@ from jaxslam.logs.truth import wrap
 from jaxslam.models.sensors import Measurements
 from jaxslam.parameters import default_params
 from jaxslam.results.metrics import ate, pair_by_distance
+from jaxslam.runs.run import config_for
 from jaxslam.simulation import planar
 from jaxslam.smoother import least_squares as bundle
 from jaxslam.smoother import normal_equations
@@ -72,7 +73,7 @@ def test_chain_is_the_dense_solution(points):
     right = rng.normal(size=len(dense))
     blocks = dense[: 3 * poses, : 3 * poses].reshape(poses, 3, poses, 3)
     at = np.arange(poses)
-    normal = normal_equations.Normal(
+    normal = normal_equations.NormalEquations(
         diagonal=blocks[at, :, at],
         off=blocks[at[:-1], :, at[1:]],
         border=normal_equations.csr_array(dense[3 * poses :, : 3 * poses]),
@@ -93,7 +94,7 @@ def test_chain_is_the_dense_solution(points):
 
 
 def test_chain_says_when_a_matrix_is_not_positive_definite():
-    normal = normal_equations.Normal(
+    normal = normal_equations.NormalEquations(
         -np.eye(3)[None],
         np.zeros((0, 3, 3)),
         normal_equations.csr_array((0, 3)),
@@ -233,7 +234,8 @@ def room(sensor, known, **changes):
         "room", 2, length_m=40.0, rate_hz=2.5, landmarks=14, max_per_frame=6, **changes
     )
     params = default_params(sensor, log)
-    data = frames_from_log(log, sensor, None, params, known)
+    association = "known" if known else "maximum_likelihood"
+    data = frames_from_log(log, config_for(log, sensor, association, descriptors=0), params)
     true = log.truth.pose
     along = np.linspace(0, 3, len(true))
     bent = true + np.stack([0.3 * np.sin(along), 0.3 * (np.cos(along) - 1), 0.1 * np.sin(along)], 1)
@@ -399,7 +401,7 @@ def test_errors_that_stay_alike_count_less():
         # A radian counts as a tenth of a metre.
         travel = odometry.distance + 0.1 * odometry.turn
         expected = np.tanh(travel / 2) if correlation else np.ones(6)
-        np.testing.assert_allclose(given.share, expected[given.frame], rtol=1e-6)
+        np.testing.assert_allclose(given.tempering, expected[given.frame], rtol=1e-6)
         got = refine(
             data, pose, np.full((6, 3), -1), np.zeros(3), None, params, "range_bearing", True
         )

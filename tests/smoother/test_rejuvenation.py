@@ -9,14 +9,21 @@ from test_refine import births, room
 
 from jaxslam import run
 from jaxslam.config import Config
-from jaxslam.filter import step
+from jaxslam.filter import map_estimate
+from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.odometry import Odometry
 from jaxslam.results.events import list_events
 from jaxslam.results.metrics import compute_errors
 from jaxslam.runs import compiled
 from jaxslam.runs import run as runner
 from jaxslam.simulation.planar import planar
-from jaxslam.smoother import least_squares, posterior_sampling, refine, rejuvenation
+from jaxslam.smoother import (
+    least_squares,
+    posterior_sampling,
+    reassociation,
+    refine,
+    rejuvenation,
+)
 from jaxslam.smoother.events import DROPPED, FAILED, FOUND, MERGED
 
 
@@ -41,24 +48,26 @@ def solved():
     log, data, params, true, _ = room("bearing", False)
     landmark_id, _ = births(log, data)
     with jax.enable_x64(True):
-        given, place = least_squares.make_problem(
+        problem, flat_index = least_squares.make_problem(
             data, log.start_pose, np.eye(3) * 1e-4, params, "bearing"
         )
         found = refine.solve_and_reassociate(
-            given, place, true, landmark_id.ravel()[place], False, again=True
+            problem, flat_index, true, landmark_id.ravel()[flat_index], False, again=True
         )
-    return given, found
+    return problem, found
 
 
 def test_pose_and_points_are_those_of_the_whole_inverse(solved):
     """Against a dense inverse of the whole normal matrix, and of its part with the path given."""
-    given, found = solved
+    problem, found = solved
     fit = found.fit
-    rows, which = refine.regroup.inside(found.groups)
+    rows, which = reassociation.index_mapped(found.groups)
     size, poses = len(rows), 3 * len(fit.path)
     with jax.enable_x64(True):
-        linear = least_squares._linearise(given, fit.path, fit.points, which)
-        normal = least_squares._assemble(given, linear, fit.weight * given.share, which, size, 0.0)
+        linear = least_squares._linearise(problem, fit.path, fit.points, which)
+        normal = least_squares._assemble(
+            problem, linear, fit.weight * problem.tempering, which, size, 0.0
+        )
     whole = np.zeros((poses + 2 * size,) * 2)
     for t, block in enumerate(normal.diagonal):
         whole[3 * t : 3 * t + 3, 3 * t : 3 * t + 3] = block
@@ -94,7 +103,7 @@ def test_drawn_particles_have_the_moments_asked_for(sensor):
     joint.kind[[0, 2, 3]] = (
         posterior_sampling.POINT,
         posterior_sampling.POINT,
-        posterior_sampling.YOUNG,
+        posterior_sampling.UNKNOWN_DEPTH,
     )
     joint.mean[:, [0, 2]] = np.array([[3.0, 1.0], [-1.0, 2.0]]).T
     joint.anchor[:, [0, 2]] = np.array([[1.0, 0.5], [0.2, -1.0]]).T
@@ -120,7 +129,7 @@ def test_drawn_particles_have_the_moments_asked_for(sensor):
         if sensor == "bearing":
             ray = np.stack([np.cos(mean[0]), np.sin(mean[0])]) / mean[1]
             mean = world.anchor[:, slot] + ray
-            _, cov, known = step.landmarks.to_world("bearing", world)
+            _, cov, known = map_estimate.to_world("bearing", world)
             l11, l21, l22 = joint.factor[:, slot]
             exact = l11**2, l11 * l21, l21**2 + l22**2
             assert known[slot].all()
@@ -170,7 +179,7 @@ def test_hidden_bearings_become_the_map(log, found):
 
 def test_events_say_what_became_of_the_map(found):
     done, kind, label, into = found.events.T
-    assert set(done) <= set(rejuvenation.due_frames(runner.frames_of(
+    assert set(done) <= set(rejuvenation.due_frames(frames_from_log(
         found.log, found.config, found.params).odometry, found.config.rejuvenate))  # fmt: skip
     held = set()
     for which, a, b in zip(kind, label, into, strict=True):
@@ -208,9 +217,9 @@ def test_a_past_that_cannot_be_refined_stays(log, found, monkeypatch):
     monkeypatch.undo()
     solved, times = refine.solve_and_reassociate, []
 
-    def fail_at_last(*given, **told):
+    def fail_at_last(*problem, **told):
         times.append(0)
-        return (fail if len(times) == len(without.events) else solved)(*given, **told)
+        return (fail if len(times) == len(without.events) else solved)(*problem, **told)
 
     monkeypatch.setattr(refine, "solve_and_reassociate", fail_at_last)
     last = run(log, found.config, seed=1, refine=False)
@@ -238,8 +247,8 @@ def test_it_goes_on_from_a_checkpoint_with_the_same_bits(log, found, tmp_path):
     from jaxslam.runs import checkpoints
 
     class Stopped(checkpoints.Checkpoints):
-        def reached(self, at, total, line):
-            super().reached(at, total, line)
+        def save_if_due(self, at, total, line):
+            super().save_if_due(at, total, line)
             if at.done >= total // 2:
                 raise KeyboardInterrupt
 

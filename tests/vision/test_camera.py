@@ -168,7 +168,7 @@ def test_what_is_not_imaged_is_nan():
         (dict(elevation=(0.5, 0.1)), "elevation 0.5..0.1 rad; must rise"),
         (dict(covariance=np.eye(3)), "covariance is not 11 x 11"),
         (dict(position=(1.0, 2.0)), "position has 2 numbers; must be 3"),
-        (dict(model="unified", params=(*SPHERE[:5], -1.0, *SPHERE[6:])), "xi not below"),
+        (dict(model="unified", params=(*SPHERE[:5], -1.0, *SPHERE[6:])), "xi at least 0"),
     ],
 )
 def test_bad_cameras_are_refused(change, message):

@@ -151,11 +151,11 @@ def spoilt(text, old, new):
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
-        ("model =", "modell =", "modell is no field"),
+        ("model =", "modell =", "modell is not a field"),
         ('"polynomial"', '"pinhole"', "model is 'pinhole'"),
         ("mirror = false", 'mirror = "no"', "mirror is 'no'"),
         ("a0 = ", "b0 = ", "params.a0 is missing"),
-        ("cx = 515.3", 'cx = "left"', "params is not made of numbers"),
+        ("cx = 515.3", 'cx = "left"', "params does not consist of numbers"),
         ("cx = 515.3", "cx = nan", "params must be finite"),
         ("width = 1024", "width = -3", "width -3"),
         ("[params]", "[params", "is not TOML"),
@@ -176,7 +176,10 @@ def test_faults_of_toml_are_named(tmp_path, old, new, told):
         (lambda lines: lines[:-2], "image size is missing"),
         (lambda lines: [x.replace("768 1024", "768.5 1024") for x in lines], "whole number"),
         (lambda lines: [x.replace("768 1024", "768") for x in lines], "image size has 1 number"),
-        (lambda lines: [x.replace("5 -", "6 -") for x in lines], "says 6 coefficients but has 5"),
+        (
+            lambda lines: [x.replace("5 -", "6 -") for x in lines],
+            "announces 6 coefficients but has 5",
+        ),
         (lambda lines: [x.replace("768 1024", "high wide") for x in lines], "is high wide"),
     ],
 )

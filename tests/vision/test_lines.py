@@ -11,8 +11,8 @@ from stripes import mirror_camera, painted, photograph, room_of_stripes, stripes
 
 from jaxslam.simulation.room.furniture import furnish
 from jaxslam.simulation.room.geometry import visible_edges
-from jaxslam.simulation.room.render import PRESETS, double_mirror_camera, frames
-from jaxslam.vision.line_merging import merged, separated
+from jaxslam.simulation.room.render import PRESETS, double_mirror_camera, render_frames
+from jaxslam.vision.line_merging import merge_pieces, separate_close_pairs
 from jaxslam.vision.lines import Lines, LineSettings, extract_lines, halves, is_dark
 from jaxslam.vision.overlay import draw_lines, draw_on_image
 from jaxslam.vision.panorama import panorama, unwrap
@@ -129,7 +129,9 @@ def test_merging_reaches_over_the_seam_and_minds_polarity_and_gap():
         return Lines(np.array(bearing), 0.001 * ones, np.array(low), np.array(high),
                      np.array(polarity), colour, ones)  # fmt: skip
 
-    over = merged(pieces([-pi + 0.001, pi - 0.001], [0.0, 0.3], [0.2, 0.5], [1, 1]), 0.005, 0.2)
+    over = merge_pieces(
+        pieces([-pi + 0.001, pi - 0.001], [0.0, 0.3], [0.2, 0.5], [1, 1]), 0.005, 0.2
+    )
     assert len(over.bearing) == 1
     assert abs(abs(over.bearing[0]) - pi) < 1e-9
     assert (over.low[0], over.high[0]) == (0.0, 0.5)
@@ -138,7 +140,7 @@ def test_merging_reaches_over_the_seam_and_minds_polarity_and_gap():
         pieces([0.0, 0.001], [0.0, 0.9], [0.2, 1.1], [1, 1]),
         pieces([0.0, 0.01], [0.0, 0.3], [0.2, 0.5], [1, 1]),
     ):
-        assert len(merged(other, 0.005, 0.2).bearing) == 2
+        assert len(merge_pieces(other, 0.005, 0.2).bearing) == 2
 
 
 def test_what_is_not_vertical_is_no_line():
@@ -215,10 +217,13 @@ def test_pushed_pairs_are_moved_together():
     ones = np.ones(2)
     lines = Lines(np.array([0.0, 0.02]), 0.001 * ones, 0 * ones, ones, np.array([1, -1]),
                   np.zeros((2, 2, 3), np.float32), ones)  # fmt: skip
-    near = separated(lines, 0.009)
+    near = separate_close_pairs(lines, 0.009)
     assert 0 < near.bearing[0] < near.bearing[1] < 0.02
     assert (near.sigma > lines.sigma).all()
-    far, same = separated(lines, 0.002), separated(lines._replace(polarity=np.ones(2)), 0.009)
+    far, same = (
+        separate_close_pairs(lines, 0.002),
+        separate_close_pairs(lines._replace(polarity=np.ones(2)), 0.009),
+    )
     assert np.allclose(far.bearing, lines.bearing) and np.allclose(same.bearing, lines.bearing)
 
 
@@ -283,7 +288,7 @@ def test_the_rendered_rooms_edges_are_found(preset, most):
     poses = np.array([(1.3, 1.2, 0.4), (4.1, 0.9, 2.0), (6.2, 3.0, -1.0), (8.6, 2.7, -2.5)])
     drive = SimpleNamespace(pose=poses, command=np.zeros((3, 2)))
     errors, clear, found, false = [], 0, 0, 0
-    for image, pose, _ in frames(world, camera, drive, PRESETS[preset], seed=20):
+    for image, pose, _ in render_frames(world, camera, drive, PRESETS[preset], seed=20):
         edges, lines = visible_edges(world, pose), extract_lines(image, camera)
         i, _, away = paired(edges.bearing, lines)
         errors.extend(np.degrees(away))

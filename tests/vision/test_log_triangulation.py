@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibration import sensor, sensor_report
-from calibration.points import compare, coverage, identified, point_errors, with_model
+from calibration.points import apply_model, compare, coverage, identify_lines, point_errors
 from jaxslam.logs.log import Log, Truth
 
 STEP, SIGMA = 0.3, math.radians(0.2)
@@ -134,7 +134,7 @@ def test_bearings_are_named_by_the_surveyed_line_they_point_at():
     bearing = log.bearing.copy()
     bearing[0] += 0.8
     unnamed = replace(log, bearing=bearing, truth=replace(log.truth, identity=None))
-    found = identified(unnamed).truth.identity
+    found = identify_lines(unnamed).truth.identity
     assert (found[1:] == log.truth.identity[1:]).mean() > 0.95
     assert found[0] != log.truth.identity[0]
 
@@ -142,7 +142,7 @@ def test_bearings_are_named_by_the_surveyed_line_they_point_at():
 def test_the_filter_gets_the_models_covariances():
     log = straight(7, same)
     model = next(m for m in compare(point_errors(log)) if m.name == "one fitted normal")
-    point = with_model(model, log)
+    point = apply_model(model, log)
     off = point.point - log.point
     along = (off * log.point).sum(1) / np.linalg.norm(log.point, axis=1)
     assert np.allclose(along, -model.values["mean_along_m"], atol=1e-6)

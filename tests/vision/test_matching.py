@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxslam.vision.lines import Lines
-from jaxslam.vision.matching import MatchSettings, assign_pairs, light_gain, match
+from jaxslam.vision.matching import assign_pairs, light_gain, match
 
 ROOM = (10.0, 4.0)
 SIGMA = 0.002  # rad
@@ -82,7 +82,7 @@ def scores(step, **settings):
     right = given = possible = 0
     for seed in range(3):
         for a, edge_a, b, edge_b, motion in drive(seed, step):
-            pairs = match(a, b, motion, MatchSettings(**settings))
+            pairs = match(a, b, motion, **settings)
             right += (edge_a[pairs[:, 0]] == edge_b[pairs[:, 1]]).sum()
             given += len(pairs)
             possible += len(np.intersect1d(edge_a, edge_b))

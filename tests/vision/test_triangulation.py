@@ -8,9 +8,9 @@ import pytest
 from jaxslam.logs.log import Log, Truth
 from jaxslam.logs.log_file import load_log, save_log
 from jaxslam.logs.odometry import Odometry, increments, moments
+from jaxslam.logs.slicing import select_frames
 from jaxslam.models import motion
 from jaxslam.parameters import default_params
-from jaxslam.reference.compare import select_frames
 from jaxslam.simulation import planar
 from jaxslam.vision.log_triangulation import PointSettings, triangulate_log
 from jaxslam.vision.triangulation import (
@@ -22,7 +22,7 @@ from jaxslam.vision.triangulation import (
     STILL,
     TriangulationSettings,
     compose,
-    of_sensor,
+    sensor_motion,
     triangulate,
 )
 
@@ -168,8 +168,8 @@ def test_motions_compose_and_move_to_the_sensor_with_their_errors():
     drawn = first + np.column_stack([c * x - s * y, s * x + c * y, turn])
     np.testing.assert_allclose(drawn.mean(0), mean[0], atol=1e-3)
     np.testing.assert_allclose(np.cov(drawn.T), cov[0], atol=0.02 * cov[0].max())
-    seen, seen_cov = of_sensor(STEP[None], STEP_COV[None], mounting)
-    drawn = of_sensor(first, np.zeros((count, 3, 3)), mounting)[0]
+    seen, seen_cov = sensor_motion(STEP[None], STEP_COV[None], mounting)
+    drawn = sensor_motion(first, np.zeros((count, 3, 3)), mounting)[0]
     np.testing.assert_allclose(np.cov(drawn.T), seen_cov[0], atol=0.02 * seen_cov[0].max())
     # A point fixed on the ground, by way of both frames.
     point = np.array([[2.0, 1.0]])

@@ -1,4 +1,4 @@
-"""The University of Toronto course's log (AER1513 `dataset2.mat`, "Lost in the Woods")."""
+"""Read the log of a University of Toronto course (AER1513 `dataset2.mat`, "Lost in the Woods")."""
 
 from math import pi
 from pathlib import Path
@@ -11,18 +11,18 @@ from jaxslam.logs.readers.text_table import LAST_STAMP_S, NANOSECONDS, in_order,
 
 NEEDED = ("t", "v", "om", "r", "b", "d")
 OPTIONAL = ("l", "x_true", "y_true", "th_true", "true_valid")
-VIEW = (-2 * pi / 3, 2 * pi / 3, 6.0)  # rad, rad, m: 240 deg laser scanner, 5.6 m seen at most
-STEP_NS = 1000  # stamps are read to the microsecond: float64 seconds hold no more that is meant
+VIEW = (-2 * pi / 3, 2 * pi / 3, 6.0)  # rad, rad, m: 240 deg laser scanner, ranges to 5.6 m
+STEP_NS = 1000  # stamps are rounded to the microsecond: float64 seconds are no more precise
 
 
 def read_mat(path, lag=1, time_offset=0.0):
-    """`Log` of the course's `.mat`: odometry, ranges and bearings with identities, truth.
+    """Read the course's `.mat`: odometry, ranges and bearings with identities, truth.
 
-    The speed `v[k]` and yaw rate `om[k]` are stamped t[k - lag]: the course lets them act on
+    The speed `v[k]` and yaw rate `om[k]` are stamped t[k - lag]; in the course they act on
     (t[k-1], t[k]], lag 1. `r[k, i]` and `b[k, i]` are landmark i's range and bearing at t[k] (plus
     `time_offset` s), 0 where not seen, in the frame of a scanner `d` ahead of the axle. Every step
-    is a frame. The start pose is the truth at the first step (zero without). Raises `ValueError`
-    naming the file and variable.
+    is a frame. The start pose is the truth at the first step (zero without truth). Raises
+    `ValueError` naming the file and variable.
     """
     path, skipped = Path(path), {}
     data = _load(path)
@@ -55,7 +55,7 @@ def read_mat(path, lag=1, time_offset=0.0):
 
 
 def _steps(path, t, skipped):
-    """Rows in order of time, and their stamps in ns."""
+    """Indices of the rows in order of time, and their stamps [ns]."""
     usable = np.isfinite(t)
     if not usable.all():
         skipped["step without a stamp"] = int((~usable).sum())
@@ -69,10 +69,10 @@ def _steps(path, t, skipped):
 
 
 def _seen(path, ranges, bearings, skipped):
-    """Mask of the measurements; what is there but no measurement is counted."""
-    there = (ranges != 0) | (bearings != 0)
-    good = there & np.isfinite(ranges) & np.isfinite(bearings) & (ranges > 0)
-    lost = int((there & ~good).sum())
+    """Mask of the valid measurements; counts the others in `skipped`."""
+    measured = (ranges != 0) | (bearings != 0)
+    good = measured & np.isfinite(ranges) & np.isfinite(bearings) & (ranges > 0)
+    lost = int((measured & ~good).sum())
     if lost:
         skipped["range or bearing that is not finite, or range not above 0"] = lost
     if np.abs(bearings[good]).max(initial=0) > 2 * pi:
@@ -81,7 +81,7 @@ def _seen(path, ranges, bearings, skipped):
 
 
 def _truth(data, steps, time, identity):
-    """Poses where the course calls them valid, landmarks and identities."""
+    """`Truth`: poses where the course calls them valid, landmarks and identities."""
     known = {}
     if {"x_true", "y_true", "th_true"} <= set(data):
         pose = np.column_stack([data["x_true"], data["y_true"], data["th_true"]])[steps]
@@ -95,7 +95,7 @@ def _truth(data, steps, time, identity):
 
 
 def _load(path):
-    """Variables by name, each of the right shape."""
+    """Load the variables by name, each of the right shape."""
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     try:
@@ -108,11 +108,11 @@ def _load(path):
     for name, array in data.items():
         if array is None:
             raise ValueError(f"{path}: {name}: is not a plain array of numbers")
-    return _shaped(path, data)
+    return _check_shapes(path, data)
 
 
-def _shaped(path, data):
-    """Columns as vectors, after a look at every shape."""
+def _check_shapes(path, data):
+    """Check every shape and flatten columns to vectors."""
     steps, landmarks = data["t"].size, data["r"].shape[-1]
     shapes = {"r": (steps, landmarks), "b": (steps, landmarks), "l": (landmarks, 2), "d": (1, 1)}
     for name, array in data.items():

@@ -1,17 +1,17 @@
-"""A log from CSV files: one of odometry, one of measurements, and optionally truth.
+"""Read a log from CSV files: one of odometry, one of measurements, and optionally truth.
 
-Each starts with a header row that names its columns, exactly one of these:
+Each starts with a header row that is exactly one of these:
 
-odometry      time_s,forward_m_s,yaw_rate_rad_s   velocities, held until the next row
-              time_s,distance_m,turn_rad          commands: drive, then turn, done at time_s
-measurements  time_s,bearing_rad[,range_m][,identity]
-              time_s,x_m,y_m,sxx,sxy,syy[,identity]    point in the sensor's frame, covariance m^2
-truth         time_s,x_m,y_m,theta_rad
-landmarks     id,x_m,y_m                          true landmarks
+    odometry      time_s,forward_m_s,yaw_rate_rad_s   velocities, held until the next row
+                  time_s,distance_m,turn_rad          commands: drive, then turn, done at time_s
+    measurements  time_s,bearing_rad[,range_m][,identity]
+                  time_s,x_m,y_m,sxx,sxy,syy[,identity]    point in the sensor's frame, covariance m^2
+    truth         time_s,x_m,y_m,theta_rad
+    landmarks     id,x_m,y_m                          true landmarks
 
-Measurements may have further columns look_NAME, numbers that say how what was measured looks: the
-log's descriptors. Rows of one stamp are one frame; a row with nothing but its stamp is a frame that
-saw nothing. An empty `identity` means none. `#` begins a comment.
+Measurements may have further columns look_NAME, numbers that describe appearance: the log's
+descriptors. Rows of one stamp are one frame; a row with nothing but its stamp is an empty frame. An
+empty `identity` means none. `#` begins a comment.
 """
 
 from math import pi
@@ -48,18 +48,18 @@ LAYOUTS = {
     "landmarks": [("id", "x_m", "y_m")],
 }
 LOOK = "look_"
-REACH = 10.0  # m, declared when nothing was measured that tells
-MOST_YAW_RATE = 6 * pi  # rad/s
+VIEW_RANGE = 10.0  # m, declared when there are no ranges
+MAX_YAW_RATE = 6 * pi  # rad/s
 
 
 def read_csv(paths, view=None, mounting=(0.0, 0.0, 0.0)):
-    """`Log` of two to four CSV files, told apart by their headers.
+    """Read the `Log` of two to four CSV files, distinguished by their headers.
 
-    `view` (least bearing, largest bearing [rad], range [m]) is what the sensor can see; left out,
-    it is what it did see. Start pose: the truth at the start, else zero. Raises `ValueError` naming
-    file and line.
+    `view` (least bearing, largest bearing [rad], range [m]) of the sensor; None: the smallest that
+    holds all measurements. The start pose is the truth at the start, else zero. Raises `ValueError`
+    naming file and line.
     """
-    files = _sorted_out(paths)
+    files = _open_all(paths)
     skipped = {}
     kind, odometry = _odometry(files["odometry"], skipped)
     columns, measured = _measurements(files["measurements"], skipped)
@@ -71,7 +71,7 @@ def read_csv(paths, view=None, mounting=(0.0, 0.0, 0.0)):
     identity = column.get("identity")
     if identity is not None:
         identity = np.where(np.isnan(identity), -1, identity).astype(np.int64)
-    looks = [name.startswith(LOOK) for name in columns]
+    described = [name.startswith(LOOK) for name in columns]
     bearing, distance = column.get("bearing_rad"), column.get("range_m")
     if bearing is not None:
         bearing = wrap_bearings(bearing)
@@ -91,7 +91,7 @@ def read_csv(paths, view=None, mounting=(0.0, 0.0, 0.0)):
         point=value[:, :2] if bearing is None else None,
         point_cov=value[:, 2:5] if bearing is None else None,
         identity=identity,
-        descriptor=value[:, looks] if any(looks) else None,
+        descriptor=value[:, described] if any(described) else None,
         view=_view(value, bearing, distance) if view is None else view,
         mounting=mounting,
         start_pose=np.zeros(3) if pose is None else pose,
@@ -101,8 +101,11 @@ def read_csv(paths, view=None, mounting=(0.0, 0.0, 0.0)):
 
 
 def read_odometry(path, skipped):
-    """Kind ("velocity" or "command") and `Table` in order of time; counts bad rows in `skipped`."""
-    name, file = _opened(Path(path), ["odometry"])
+    """Read the kind ("velocity" or "command") and the `Table` in order of time.
+
+    Counts bad rows in `skipped`.
+    """
+    name, file = _open(Path(path), ["odometry"])
     if name != "odometry":
         header = " or ".join(",".join(layout) for layout in LAYOUTS["odometry"])
         raise ValueError(f"{path}: is a {name} file; odometry has the header {header}")
@@ -112,44 +115,45 @@ def read_odometry(path, skipped):
 
 
 def read_truth(paths, skipped):
-    """`Truth` of a file of poses, one of landmarks, or both; None of neither."""
+    """Read the `Truth` in a file of poses, one of landmarks, or both; None without files."""
     files = {}
     for path in map(Path, paths):
-        name, file = _opened(path, ["truth", "landmarks"])
+        name, file = _open(path, ["truth", "landmarks"])
         if name not in ("truth", "landmarks") or name in files:
-            raise ValueError(f"{path}: is a {name} file; one of truth and one of landmarks may be")
+            allowed = "give at most one of truth and one of landmarks"
+            raise ValueError(f"{path}: is a {name} file; {allowed}")
         files[name] = file
     return _truth(files, skipped)
 
 
-def _opened(path, wanted=LAYOUTS):
-    """Kind of a file by its header; its path, columns, lines and completeness."""
+def _open(path, wanted=LAYOUTS):
+    """Read a file: its kind by the header; its path, columns, lines and completeness."""
     lines, complete = read_lines(path, ",")
     header = tuple(cell.strip('"').lower() for cell in lines[0][1])
-    kinds = [kind for kind, layouts in LAYOUTS.items() if _plain(header, kind) in layouts]
+    kinds = [kind for kind, layouts in LAYOUTS.items() if _without_looks(header, kind) in layouts]
     if not kinds:
         found = ",".join(header)[:80]
         allowed = " or ".join(",".join(row) for kind in wanted for row in LAYOUTS[kind])
         if "measurements" in wanted:
             allowed += "; of measurements also look_NAME columns at the end"
-        place = f"{path}, line {lines[0][0]}"
-        raise ValueError(f"{place}: {found!r} is no known header; allowed: {allowed}")
+        where = f"{path}, line {lines[0][0]}"
+        raise ValueError(f"{where}: {found!r} is no known header; allowed: {allowed}")
     return kinds[0], (path, header, lines[1:], complete)
 
 
-def _plain(header, kind):
-    """The header without looks, which only measurements may have, after all else, one name each."""
-    looks = [name.startswith(LOOK) for name in header]
-    size = looks.index(True) if True in looks else len(header)
-    fits = kind == "measurements" and all(looks[size:]) and len(set(header)) == len(header)
+def _without_looks(header, kind):
+    """The header without look_NAME columns, if it may have them: measurements, at the end, once."""
+    described = [name.startswith(LOOK) for name in header]
+    size = described.index(True) if True in described else len(header)
+    fits = kind == "measurements" and all(described[size:]) and len(set(header)) == len(header)
     return header[:size] if fits else header
 
 
-def _sorted_out(paths):
-    """Path, columns, lines and completeness of the file of each kind."""
+def _open_all(paths):
+    """Read the file of each kind: path, columns, lines and completeness."""
     files = {}
     for path in map(Path, paths):
-        kind, file = _opened(path)
+        kind, file = _open(path)
         if kind in files:
             raise ValueError(f"{path}: is a second {kind} file, after {files[kind][0]}")
         files[kind] = file
@@ -169,14 +173,14 @@ def _parse(file, **options):
 def _odometry(file, skipped):
     table = _parse(file)
     velocity = file[1][1:] == VELOCITY
-    limit = MOST_YAW_RATE if velocity else 2 * pi
+    limit = MAX_YAW_RATE if velocity else 2 * pi
     reason = f"turn beyond {limit:.1f} rad{'/s' * velocity} (degrees? multiply by pi/180)"
     table = drop_rows(table, np.abs(table.value[:, 1]) > limit, reason, unit=True)
     return "velocity" if velocity else "command", drop_bad_rows(table, skipped)
 
 
 def _measurements(file, skipped):
-    """Columns after the stamp, and the rows in order of time; NaN where a frame saw nothing."""
+    """Columns after the stamp, and the rows in order of time; a row of NaN is an empty frame."""
     table, columns = _parse(file, blanks=True), file[1][1:]
     needed = [name != "identity" for name in columns]
     blank = np.isnan(table.value)
@@ -203,14 +207,16 @@ def _measurements(file, skipped):
 
 
 def _view(value, bearing, distance):
-    """The smallest view that explains every measurement."""
+    """The smallest view that holds all measurements."""
     if len(value) == 0:
-        return -pi, pi, REACH
+        return -pi, pi, VIEW_RANGE
     angle = np.arctan2(value[:, 1], value[:, 0]) if bearing is None else bearing
     far = np.hypot(value[:, 0], value[:, 1]) if bearing is None else distance
     least, largest = float(angle.min()), float(angle.max())
     narrow = 0 < largest - least < 1.8 * pi
-    return *((least, largest) if narrow else (-pi, pi)), REACH if far is None else float(far.max())
+    return *((least, largest) if narrow else (-pi, pi)), VIEW_RANGE if far is None else float(
+        far.max()
+    )
 
 
 def _truth(files, skipped):

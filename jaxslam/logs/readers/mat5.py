@@ -1,6 +1,6 @@
-"""Plain numeric variables of a MATLAB file of version 5 (save -v7 or -v6).
+"""Read plain numeric variables of a MATLAB file of version 5 (save -v7 or -v6).
 
-Our own few lines, since scipy's reader was seen to crash the whole process on damaged files.
+Written here because SciPy's reader was seen to crash the whole process on damaged files.
 Layout: MathWorks, "MAT-File Format", level 5.
 """
 
@@ -20,7 +20,7 @@ HEADER = 128
 
 
 def read_variables(path, wanted):
-    """Variables by name, float64 with their own shape; those that are no plain numbers are None.
+    """Read the variables named in `wanted`: float64 arrays by name, None if not plain numbers.
 
     Raises `ValueError` saying what is wrong with the file, without its name.
     """
@@ -32,11 +32,11 @@ def read_variables(path, wanted):
         raise ValueError("it has no header of version 5")
     if struct.unpack_from(order + "H", data, HEADER - 4) != (0x0100,):
         raise ValueError("another version than 5; save it with -v7")
-    room, variables = MAX_BYTES, {}
+    budget, variables = MAX_BYTES, {}
     for kind, body in _elements(data[HEADER:], order):
         if kind == COMPRESSED:
-            kind, body = _unpacked(body, order, room)
-            room -= len(body)
+            kind, body = _unpack(body, order, budget)
+            budget -= len(body)
         if kind == MATRIX:
             name, array = _variable(body, order)
             if name in wanted:
@@ -45,37 +45,37 @@ def read_variables(path, wanted):
 
 
 def _elements(data, order):
-    """Type and bytes of the elements that follow one another."""
-    place = 0
-    while place < len(data):
-        if len(data) - place < 8:
+    """Yield type and bytes of successive elements."""
+    offset = 0
+    while offset < len(data):
+        if len(data) - offset < 8:
             raise ValueError("it is cut")
-        kind, size = struct.unpack_from(order + "II", data, place)
-        start, place = place + 8, place + 8
-        if kind >> 16:  # up to four bytes stand in the tag itself
+        kind, size = struct.unpack_from(order + "II", data, offset)
+        start, offset = offset + 8, offset + 8
+        if kind >> 16:  # up to four bytes of data are in the tag itself
             start, size, kind = start - 4, kind >> 16, kind & 0xFFFF
             if size > 4:
                 raise ValueError("a damaged element")
         else:
-            place += size if kind == COMPRESSED else size + -size % 8
+            offset += size if kind == COMPRESSED else size + -size % 8
         if start + size > len(data):
             raise ValueError("it is cut")
         yield kind, data[start : start + size]
 
 
-def _unpacked(body, order, room):
+def _unpack(body, order, budget):
     stream = zlib.decompressobj()
     try:
-        data = stream.decompress(body, max(room, 1))
+        data = stream.decompress(body, max(budget, 1))
     except zlib.error as err:
         raise ValueError(f"a damaged variable ({err})") from None
     if not stream.eof:
-        raise ValueError(f"a variable is cut, or longer than {room} bytes")
+        raise ValueError(f"a variable is cut, or longer than {budget} bytes")
     return next(_elements(memoryview(data), order), (0, b""))
 
 
 def _variable(body, order):
-    """Name and array of one matrix element."""
+    """Name and array of a matrix element."""
     parts = list(islice(_elements(body, order), 4))
     if len(parts) < 3 or len(parts[0][1]) != 8 or len(parts[1][1]) % 4:
         return "", None

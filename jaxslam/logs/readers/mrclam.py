@@ -1,4 +1,7 @@
-"""UTIAS Multi-Robot Cooperative Localization and Mapping (Leung et al., IJRR 2011): one robot."""
+"""Read one robot's log of the MRCLAM data sets.
+
+UTIAS Multi-Robot Cooperative Localization and Mapping (Leung et al., IJRR 2011).
+"""
 
 import re
 from pathlib import Path
@@ -22,12 +25,13 @@ VIEW = (-0.60, 0.60, 9.0)  # rad, rad, m: the camera's field of view
 
 
 def read_mrclam(folder, robot=None):
-    """`Log` of one robot of an MRCLAM folder; `robot` may be left out when there is only one.
+    """Read the `Log` of one robot in an MRCLAM folder; `robot` may be None if there is only one.
 
     Odometry is the commanded velocity. Every stamp of the measurement file is a frame, also where
-    only other robots were seen. Identities are subject numbers, found from barcodes. The start pose
-    is the truth at the start (zero where truth does not reach it); truth is optional. In the
-    published Dataset 1 the true places of landmarks 11 and 17 are exchanged. Raises `ValueError`.
+    only other robots were seen. Identities are subject numbers, looked up by barcode. The start
+    pose is the truth at the start (zero where truth does not reach it); truth is optional. In the
+    published Dataset 1 the true positions of landmarks 11 and 17 are exchanged. Raises
+    `ValueError`.
     """
     folder = Path(folder)
     robot = _robot(folder, robot)
@@ -69,7 +73,7 @@ def _robot(folder, robot):
 
 
 def _table(path, width, skipped, ids=0):
-    """Rows that begin with a stamp, or with `ids` whole numbers."""
+    """Read rows that begin with a stamp, or with `ids` whole numbers."""
     lines, complete = read_lines(path)
     table = parse(path, lines, width, complete, stamped=not ids)
     wrong = ~to_integers(table.value[:, :ids]).all(axis=1)
@@ -77,7 +81,7 @@ def _table(path, width, skipped, ids=0):
 
 
 def _measurements(path, skipped):
-    """Barcode, range and bearing, in order of time."""
+    """Read barcode, range and bearing, in order of time."""
     lines, complete = read_lines(path)
     table = parse(path, lines, 4, complete)
     code, distance, bearing = table.value.T
@@ -94,7 +98,7 @@ def _measurements(path, skipped):
 
 
 def _subjects(path, codes, skipped):
-    """Subject per barcode seen, 0 where it is not in the list; what is no landmark is counted."""
+    """Subject of each barcode, 0 if it is not listed; counts in `skipped` what is no landmark."""
     table = _table(path, 2, skipped, ids=2)
     subjects = {int(code): int(subject) for subject, code in table.value}
     if len(subjects) != len(table.value):

@@ -1,7 +1,7 @@
-"""Text tables of other people's logs: exact stamps, bad rows counted, units checked.
+"""Read text tables: exact stamps, bad rows counted, units checked.
 
-A single bad row is skipped and counted; more than 5 % of them, or two rows beyond a unit's limit,
-mean that the file is not what it was taken for.
+A bad row is skipped and counted. More than 5 % of bad rows, or two rows beyond a unit's limit,
+raise: the file has another format or unit.
 """
 
 from decimal import Decimal, InvalidOperation
@@ -21,7 +21,7 @@ NANOSECONDS = "that is no time in seconds (nanoseconds? divide them by 1e9)"
 class Table(NamedTuple):
     """Rows of a file: line numbers [n], stamps int64 [n] ns (0 without), other columns [n, c].
 
-    `bad` lists the rows left out, as (line, reason).
+    `bad`: the rows left out, as (line, reason).
     """
 
     path: Path
@@ -32,7 +32,8 @@ class Table(NamedTuple):
 
 
 def read_lines(path, separator=None):
-    """Cells of every line that is not blank or a comment, with its number, from 1 on."""
+    """Read (number from 1, cells) of every line that is not blank or a comment; and whether the
+    last line is complete."""
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
@@ -51,10 +52,10 @@ def read_lines(path, separator=None):
 
 
 def parse(path, lines, width, complete=True, stamped=True, blanks=False):
-    """`Table` of lines of `width` columns, the first a stamp [s] when `stamped`.
+    """Parse lines of `width` columns into a `Table`; the first is a stamp [s] if `stamped`.
 
-    `blanks`: empty cells are NaN, and a stamp may stand alone. `complete` False: the file's last
-    line has no end, so it may have been cut.
+    `blanks`: empty cells are NaN, and a stamp may stand alone. `complete` False: the last line has
+    no newline, so the file may have been cut.
     """
     good, bad = [], []
     for number, cells in lines:
@@ -77,7 +78,7 @@ def parse(path, lines, width, complete=True, stamped=True, blanks=False):
 
 
 def stamp(text):
-    """Decimal seconds as int64 ns, exactly: a Unix time in float64 is 0.2 us off."""
+    """Convert decimal seconds to int64 ns, exactly: a Unix time in float64 is 0.2 us off."""
     try:
         seconds = Decimal(text)
     except InvalidOperation:
@@ -102,7 +103,7 @@ def _number(text, blanks):
 
 
 def drop_rows(table, wrong, reason, unit=False):
-    """The table without the rows that are `wrong`; two rows of a wrong `unit` are an error."""
+    """Drop the rows that are `wrong`; raise for two of them if that means a wrong `unit`."""
     lines = table.line[wrong]
     if unit and len(lines) > 1:
         raise ValueError(f"{table.path}, line {lines[0]}: {reason} ({len(lines)} rows)")
@@ -111,20 +112,20 @@ def drop_rows(table, wrong, reason, unit=False):
 
 
 def to_integers(values):
-    """Mask of the numbers that are whole, and small enough to be meant as such."""
+    """Mask of the values that are integers, and small enough to be exact."""
     return (values == np.round(values)) & (np.abs(values) < 2**53)
 
 
 def drop_bad_rows(table, skipped):
-    """Count the bad rows in `skipped`; raise when they are too many or nothing is left."""
+    """Count bad rows in `skipped`; raise if they are too many or all."""
     bad = sorted(table.bad)
     rows = len(table.line) + len(bad)
     if len(bad) > max(1, BAD_SHARE * rows) or len(bad) == rows:
-        place = f"{table.path}, line {bad[0][0]}: {bad[0][1]}" if bad else f"{table.path}: no rows"
-        raise ValueError(f"{place} ({len(bad)} of {rows} rows are bad)")
+        where = f"{table.path}, line {bad[0][0]}: {bad[0][1]}" if bad else f"{table.path}: no rows"
+        raise ValueError(f"{where} ({len(bad)} of {rows} rows are bad)")
     if bad:
-        places = ", ".join(str(line) for line, _ in bad[:5]) + (", ..." if len(bad) > 5 else "")
-        skipped[f"bad row in {table.path.name} (line {places}: {bad[0][1]})"] = len(bad)
+        listed = ", ".join(str(line) for line, _ in bad[:5]) + (", ..." if len(bad) > 5 else "")
+        skipped[f"bad row in {table.path.name} (line {listed}: {bad[0][1]})"] = len(bad)
     first, last = int(np.argmin(table.time)), int(np.argmax(table.time))
     if (int(table.time[last]) - int(table.time[first])) / 1e9 > TEN_YEARS_S:
         lines = f"lines {table.line[first]} and {table.line[last]}"
@@ -133,9 +134,9 @@ def drop_bad_rows(table, skipped):
 
 
 def in_order(time, what, skipped, unique=True):
-    """Indices that put `time` in order; of rows with one stamp the last, when `unique`.
+    """Indices that sort `time`; if `unique`, only the last row of each stamp.
 
-    Rows out of order and rows left out are counted.
+    Counts rows out of order and rows left out in `skipped`.
     """
     order = np.argsort(time, kind="stable")
     backwards = int((np.diff(time) < 0).sum())
@@ -151,12 +152,12 @@ def in_order(time, what, skipped, unique=True):
 
 
 def wrap_bearings(angle):
-    """Angles in [-pi, pi]; those that are there already stay as they are."""
+    """Wrap angles to [-pi, pi]; those already there, pi included, keep their bits."""
     return angle - 2 * np.pi * np.round(angle / (2 * np.pi))
 
 
 def pose_at(stamp, time, pose):
-    """Pose [3] interpolated at a stamp, the heading along the shorter way; None outside."""
+    """Interpolate the pose [3] at a stamp, the heading along the shorter turn; None outside."""
     if len(time) == 0 or not time[0] <= stamp <= time[-1]:
         return None
     unwrapped = np.column_stack([pose[:, :2], np.unwrap(pose[:, 2])])

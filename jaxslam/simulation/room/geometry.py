@@ -1,9 +1,9 @@
-"""A furnished room: its surfaces, its vertical edges, and which of them a place sees.
+"""A furnished room: its surfaces, its vertical edges, and which of them are visible from a pose.
 
-The room is 10 x 4 m, x along its length, its lower-left corner at the origin. Everything in it is
-made of vertical rectangles (`Face`), seen from the side that lies to the left of start -> end, and
-of the tops and undersides of boxes. Edges and their visibility come from this geometry alone, never
-from the camera or the renderer. Metres, radians (CCW), colours blue, green, red.
+The room is 10 x 4 m, x along its length, its lower-left corner at the origin. All of it consists of
+vertical rectangles (`Face`), visible from the left of start -> end, and of the tops of boxes. Edges
+and their visibility are computed from this geometry alone, without camera or renderer. Metres,
+radians (CCW), colours blue, green, red.
 """
 
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ from jaxslam.simulation.room.textures import FLAT_TEXEL, TEXEL
 
 WIDTH, DEPTH, HEIGHT = 10.0, 4.0, 2.6  # m: along x, along y, floor to ceiling
 LANDMARK = 0.4  # m: a vertical edge at least as tall is a landmark
-ASIDE = np.radians(0.25)  # how far beside an edge its contrast is taken
-VIEW = (np.radians(-5), np.radians(65))  # elevations the double mirror shows
+ASIDE = np.radians(0.25)  # azimuth on either side of an edge at which its contrast is taken
+VIEW = (np.radians(-5), np.radians(65))  # elevations that the double mirror shows
 
 
 class Face(NamedTuple):
-    """A vertical rectangle over `start` -> `end` [2] from `bottom` to `top`, with its paint."""
+    """A vertical rectangle over `start` -> `end` [2] from `bottom` to `top`, with its texture."""
 
     start: np.ndarray
     end: np.ndarray
@@ -31,21 +31,19 @@ class Face(NamedTuple):
 
 
 class Box(NamedTuple):
-    """What stands in the room: `corner` [2], unit `axis` [2] along its width, depth to the left."""
+    """A box on the floor: `corner` [2], unit `axis` [2] along its width, depth to the left."""
 
     corner: np.ndarray
     axis: np.ndarray
     width: float
     depth: float
     top: float
-    colour: np.ndarray  # [3], of its top
+    colour: np.ndarray  # [3], of the top
 
 
 class Edges(NamedTuple):
-    """All vertical boundaries: `point` [E, 2], `bottom`, `top` [E], `kind` [E] of text.
-
-    An edge's row is its id.
-    """
+    """All vertical edges: `point` [E, 2], `bottom`, `top` [E], `kind` [E] (text). The index of an
+    edge is its id."""
 
     point: np.ndarray
     bottom: np.ndarray
@@ -54,14 +52,17 @@ class Edges(NamedTuple):
 
     @property
     def landmark(self):
-        """[E]: tall enough to be one."""
+        """Mask [E] of edges tall enough to be landmarks."""
         return self.top - self.bottom >= LANDMARK - 1e-9
 
 
 class Visible(NamedTuple):
-    """Edges seen from a place, by bearing: `id`, `bearing` in the robot's frame, `distance`,
-    elevations `low`, `high` of the longest visible piece's ends, `contrast` 0..1 between both
-    sides of it (RMS over the colours, in the room's mean light), `point` [n, 2]."""
+    """Edges visible from a pose, sorted by bearing.
+
+    `id`, `bearing` in the robot's frame, `distance`, elevations `low` and `high` of the visible
+    part, `contrast` 0..1 between its sides (RMS over colours, in the room's mean light), `point`
+    [n, 2].
+    """
 
     id: np.ndarray
     bearing: np.ndarray
@@ -74,10 +75,10 @@ class Visible(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A room as `furnish` makes it.
+    """A furnished room (`furnish`).
 
-    `faces`, the first four of them the walls, with their `start`, `end` [F, 2] and `top` [F] as
-    arrays, and `owner` [F], each face's box, -1 for a wall's; `floor`, `ceiling` uint8 [x, y, 3].
+    `faces`, the four walls first; their `start`, `end` [F, 2] and `top` [F] as arrays; `owner` [F],
+    the index of each face's box, -1 for a wall; `floor`, `ceiling` uint8 [x, y, 3].
     """
 
     faces: list[Face]
@@ -96,30 +97,30 @@ class World:
         return np.hstack([self.start, self.end])
 
     def clearance(self, point):
-        """Distance [n] of points [n, 2] to the nearest face, negative inside a box or outside."""
+        """Distance [n] of points [n, 2] to the nearest face; negative in a box or off the room."""
         point = np.atleast_2d(np.asarray(point, float))
         along, to = self.end - self.start, point[:, None] - self.start
         part = np.clip(np.sum(to * along, -1) / np.sum(along**2, -1), 0, 1)
         near = np.linalg.norm(to - part[..., None] * along, axis=-1).min(1)
-        inside = np.any([outside(box, point).max(-1) < 0 for box in self.boxes], axis=0)
+        inside = np.any([distance_outside(box, point).max(-1) < 0 for box in self.boxes], axis=0)
         beyond = np.any((point < 0) | (point > (WIDTH, DEPTH)), axis=-1)
         return np.where(inside | beyond, -near, near)
 
 
-def outside(box, point):
-    """How far points [..., 2] are beyond a box's sides, along its width and depth [..., 2]."""
+def distance_outside(box, point):
+    """Distance of points [..., 2] beyond a box's sides, along its width and depth [..., 2]."""
     to = point - box.corner
-    local = np.stack([to @ box.axis, to @ left(box.axis)], -1)
+    local = np.stack([to @ box.axis, to @ left_normal(box.axis)], -1)
     half = np.array([box.width, box.depth]) / 2
     return np.abs(local - half) - half
 
 
-def left(axis):
+def left_normal(axis):
     return np.array([-axis[1], axis[0]])
 
 
 def eye_at(pose, position):
-    """Where a camera at `position` on the robot is [3] when the robot is at (x, y, heading)."""
+    """Position [3] of a camera at `position` on the robot, for a robot at (x, y, heading)."""
     x, y, heading = pose
     c, s = cos(heading), sin(heading)
     forward, aside, height = position
@@ -127,9 +128,9 @@ def eye_at(pose, position):
 
 
 def visible_edges(world, pose, position=(0.0, 0.0, 0.6), elevation=VIEW):
-    """The `Visible` edges from a pose (x, y, heading), of a camera at `position` on the robot.
+    """Find the edges `Visible` from a pose (x, y, heading) to a camera at `position` on the robot.
 
-    `elevation` (low, high): what the camera sees. What stands before an edge hides its lower part.
+    `elevation` (low, high): the camera's view. Faces in front of an edge hide its lower part.
     """
     eye, edges, heading = eye_at(pose, position), world.edges, pose[2]
     to = edges.point - eye[:2]
@@ -150,21 +151,22 @@ def visible_edges(world, pose, position=(0.0, 0.0, 0.6), elevation=VIEW):
 
 
 def _contrast(world, eye, azimuth, low, high, rows=9):
-    """RMS over the colours of the mean difference [n] between the left and the right of edges."""
+    """RMS over colours of the mean difference [n] between left and right of edges."""
     part = (np.arange(rows) + 0.5) / rows
     elevation = low[:, None] + part * (high - low)[:, None]
     sides = []
     for side in (ASIDE, -ASIDE):
         turned = np.repeat(azimuth + side, rows)
-        sides.append(look(world, eye, turned, elevation.ravel())[1].reshape(-1, rows, 3).mean(1))
+        colour = trace_rays(world, eye, turned, elevation.ravel())[1]
+        sides.append(colour.reshape(-1, rows, 3).mean(1))
     return np.sqrt(np.mean((sides[0] - sides[1]) ** 2, axis=-1))
 
 
-def look(world, eye, azimuth, elevation):
-    """What rays [n] from `eye` [3] meet: distance over ground [n] and colour 0..1 [n, 3].
+def trace_rays(world, eye, azimuth, elevation):
+    """Trace rays [n] from `eye` [3]: distance over ground [n] and colour 0..1 [n, 3] they meet.
 
-    Every ray against every surface: slow and plain, what the renderer is held against. `azimuth`
-    and `elevation` are the world's.
+    Tests every ray against every surface: slow and plain, the reference of the renderer. `azimuth`
+    and `elevation` are in the world's frame.
     """
     eye, direction = np.asarray(eye, float), np.stack([np.cos(azimuth), np.sin(azimuth)], -1)
     slope = np.tan(elevation)
@@ -178,25 +180,25 @@ def look(world, eye, azimuth, elevation):
     colour = np.zeros((len(face), 3))
     for i in np.unique(face[np.isfinite(distance)]):
         at = (face == i) & np.isfinite(distance)
-        paint = world.faces[i].texture
-        colour[at] = _texel(paint, along[at, i] / TEXEL, height[at, i] / TEXEL)
+        texture = world.faces[i].texture
+        colour[at] = _texel(texture, along[at, i] / TEXEL, height[at, i] / TEXEL)
     with np.errstate(divide="ignore"):
-        for level, paint in ((0.0, world.floor), (HEIGHT, world.ceiling)):
+        for level, texture in ((0.0, world.floor), (HEIGHT, world.ceiling)):
             to = np.where((level - eye[2]) * slope > 0, (level - eye[2]) / slope, np.inf)
             at = to < distance
             x, y = (eye[:2] + to[at, None] * direction[at]).T / FLAT_TEXEL
-            colour[at], distance[at] = _texel(paint, x, y), to[at]
+            colour[at], distance[at] = _texel(texture, x, y), to[at]
         for box in world.boxes:
             to = np.where((box.top - eye[2]) * slope > 0, (box.top - eye[2]) / slope, np.inf)
-            to[slope >= 0] = np.inf  # tops are seen from above
+            to[slope >= 0] = np.inf  # tops are visible from above
             at = np.flatnonzero(to < distance)
-            at = at[outside(box, eye[:2] + to[at, None] * direction[at]).max(-1) < 0]
+            at = at[distance_outside(box, eye[:2] + to[at, None] * direction[at]).max(-1) < 0]
             colour[at], distance[at] = box.colour, to[at]
     return distance, colour / 255
 
 
 def _crossings(world, eye, direction):
-    """Distance [n, F] at which rays meet the front of each face (inf: not) and where along it."""
+    """Distance [n, F] at which rays meet the front of each face (inf: none), and where along it."""
     span = world.end - world.start
     length = np.linalg.norm(span, axis=-1)
     unit = span / length[:, None]
@@ -209,9 +211,9 @@ def _crossings(world, eye, direction):
     return np.where((along >= 0) & (along <= length), reach, np.inf), along
 
 
-def _texel(paint, column, row):
+def _texel(texture, column, row):
     index = (
         np.clip(axis.astype(int), 0, n - 1)
-        for axis, n in zip((column, row), paint.shape[:2], strict=True)
+        for axis, n in zip((column, row), texture.shape[:2], strict=True)
     )
-    return paint[tuple(index)]
+    return texture[tuple(index)]

@@ -1,8 +1,8 @@
-"""Ray casting a furnished room, exactly and fast: every pixel is the mean of rays spread over it.
+"""Ray cast a furnished room, exactly and fast: every pixel is the mean of rays spread over it.
 
-The rays of a camera are sorted by azimuth, once. The azimuths of all faces' ends cut the view into
-sectors; within one, the same faces lie behind each other in the same order, so a sector is painted
-from back to front. What is collected is where in one table of colours each ray ends.
+The rays of a camera are sorted by azimuth once. The azimuths of all faces' ends cut the view into
+sectors; within a sector the faces are in the same order for all rays, so it is painted from back to
+front. The result is an index into one table of colours for each ray.
 """
 
 from math import pi
@@ -10,24 +10,27 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.simulation.room.geometry import DEPTH, HEIGHT, WIDTH, World, outside
+from jaxslam.simulation.room.geometry import DEPTH, HEIGHT, WIDTH, World, distance_outside
 from jaxslam.simulation.room.textures import FLAT_TEXEL, TEXEL
 
-RIM = np.radians(1.3)  # what is imaged beyond the usable elevations, so that a tilt leaves them
+RIM = np.radians(1.3)  # imaged beyond the usable elevations, so that a tilted camera has them all
 SOFT = np.radians(0.3)  # over which the image darkens there
-DARK = 0.025  # outside, and on the mirror's holder in the middle
+DARK = 0.025  # brightness outside, and on the mirror's holder in the middle
 
 
 class Rays(NamedTuple):
-    """A camera's rays by azimuth [n] (robot frame): direction over ground [n, 2], `slope` [n], and
-    `place` [n] of each in [pixels, samples]; `pixel` [P] flat indices into the image, with their
-    `side` [P] azimuth and `share` [P] of the scene; `dark` float32 [H, W, 3], what is around it."""
+    """A camera's rays, sorted by azimuth [n] (robot frame).
+
+    `cosine`, `sine` [n] over ground, `slope` [n], and `flat_index` [n] of each ray in [pixels,
+    samples]; `pixel` [P] flat indices into the image, with the azimuth `side` [P] and the `share`
+    [P] of the scene in them; `dark` float32 [H, W, 3], the image around the scene.
+    """
 
     azimuth: np.ndarray
     cosine: np.ndarray
     sine: np.ndarray
     slope: np.ndarray
-    place: np.ndarray
+    flat_index: np.ndarray
     pixel: np.ndarray
     side: np.ndarray
     share: np.ndarray
@@ -35,36 +38,39 @@ class Rays(NamedTuple):
 
 
 def camera_rays(camera, samples=5):
-    """`Rays` of a camera, so many to a pixel."""
+    """Make the `Rays` of a camera, `samples` per pixel."""
     v, u = np.mgrid[: camera.height, : camera.width]
     pixel = np.stack([u, v], -1).reshape(-1, 2).astype(float)
     up = 1 if (camera.lens == "up") != camera.mirror else -1
-    elevation = np.arcsin(up * camera.ray(pixel)[:, 2])  # from the lens' own plane: the rim's
+    elevation = np.arcsin(up * camera.ray(pixel)[:, 2])  # relative to the lens, as its rim is
     low, high = camera.elevation[0] - RIM, camera.elevation[1] + RIM
     share = np.clip(0.5 + np.minimum(elevation - low, high - elevation) / SOFT, 0, 1)
     ring = 0.05 * np.exp(-(((elevation - high) / np.radians(4) - 1.2) ** 2) * 4)
     dark = np.repeat(DARK + ring[:, None], 3, 1)
     kept = np.flatnonzero(share > 0)
-    # a sequence of low discrepancy, shifted pixel by pixel: no row or column is preferred
+    # A low-discrepancy sequence, shifted from pixel to pixel: no row or column is preferred.
     plastic = np.array([0.7548776662, 0.5698402910])
     shift = np.random.default_rng(0).random((len(kept), 1, 2))
     spread = (shift + np.arange(samples)[:, None] * plastic) % 1 - 0.5
     direction = camera.direction((pixel[kept, None] + spread).reshape(-1, 2))
     azimuth = np.arctan2(direction[:, 1], direction[:, 0])
-    place = np.argsort(azimuth, kind="stable")
+    flat_index = np.argsort(azimuth, kind="stable")
     ground = np.hypot(direction[:, 0], direction[:, 1])
     parts = (direction[:, 0] / ground, direction[:, 1] / ground, direction[:, 2] / ground)
-    cosine, sine, slope = (part[place].astype(np.float32) for part in parts)
+    cosine, sine, slope = (part[flat_index].astype(np.float32) for part in parts)
     middle = camera.direction(pixel[kept])
     side = np.arctan2(middle[:, 1], middle[:, 0])
     dark = dark.reshape(camera.height, camera.width, 3).astype(np.float32)
     share = share[kept, None].astype(np.float32)
-    return Rays(azimuth[place], cosine, sine, slope, place, kept, side, share, dark)
+    return Rays(azimuth[flat_index], cosine, sine, slope, flat_index, kept, side, share, dark)
 
 
 class Scene(NamedTuple):
-    """A world with all its colours in one table, [n] of 4 bytes: where each face's, the floor's,
-    the ceiling's and the boxes' tops' begin, and each face's rows."""
+    """A world with all its colours in one table [n] of 4 bytes each.
+
+    `face`, `floor`, `ceiling`, `tops`: where the colours of each face, the floor, the ceiling and
+    the tops of boxes begin; `rows` of each face's texture.
+    """
 
     world: World
     colours: np.ndarray
@@ -75,8 +81,8 @@ class Scene(NamedTuple):
     tops: int
 
 
-def scene(world):
-    """The `Scene` of a `World`."""
+def build_scene(world):
+    """Build the `Scene` of a `World`."""
     tops = np.array([box.colour for box in world.boxes])[:, None]
     paints = [*(face.texture for face in world.faces), world.floor, world.ceiling, tops]
     begin = np.cumsum([0] + [paint.shape[0] * paint.shape[1] for paint in paints]).tolist()
@@ -87,7 +93,7 @@ def scene(world):
 
 
 def cast(scene, rays, eye, heading):
-    """Colours uint8 [n, 4] (the last is void) that the rays meet from `eye` [3]."""
+    """Find the colours uint8 [n, 4] (the last byte unused) that the rays from `eye` [3] meet."""
     index = np.zeros(len(rays.azimuth), np.int32)
     c, s = np.float32(np.cos(heading)), np.float32(np.sin(heading))
     dx, dy = c * rays.cosine - s * rays.sine, s * rays.cosine + c * rays.sine
@@ -100,7 +106,7 @@ def cast(scene, rays, eye, heading):
 
 
 def _sectors(world, azimuth, eye, heading):
-    """(begin, end, faces from back to front) of the pieces of the sorted azimuths [n]."""
+    """Yield (begin, end, faces from back to front) of each sector of the sorted azimuths [n]."""
     to_start, to_end = world.start - eye[:2], world.end - eye[:2]
     facing = to_start[:, 0] * to_end[:, 1] - to_start[:, 1] * to_end[:, 0] > 0
     face = np.flatnonzero(facing)
@@ -125,8 +131,8 @@ def _sectors(world, azimuth, eye, heading):
             yield bounds[k], bounds[k + 1], face[order[k, :count]]
 
 
-def _meet(scene, face, eye, dx, dy, slope):
-    """Where rays meet a face's plane: distance over ground, height, index into the colours."""
+def _intersect(scene, face, eye, dx, dy, slope):
+    """Intersect rays with a face's plane: height, and index into the face's colours."""
     start = scene.world.start[face] - eye[:2]
     span = scene.world.end[face] - scene.world.start[face]
     ex, ey = (span / np.hypot(*span)).tolist()
@@ -141,9 +147,9 @@ def _meet(scene, face, eye, dx, dy, slope):
 
 
 def _paint_wall(scene, face, eye, dx, dy, slope, index):
-    """A wall, with the floor below it and the ceiling above."""
-    height, found = _meet(scene, face, eye, dx, dy, slope)
-    index[:] = found + np.int32(scene.face[face])
+    """Paint a wall, the floor below it and the ceiling above."""
+    height, texel = _intersect(scene, face, eye, dx, dy, slope)
+    index[:] = texel + np.int32(scene.face[face])
     for level, begin, at in (
         (0.0, scene.floor, np.flatnonzero(height < 0)),
         (HEIGHT, scene.ceiling, np.flatnonzero(height >= HEIGHT)),
@@ -158,22 +164,22 @@ def _paint_wall(scene, face, eye, dx, dy, slope, index):
 
 
 def _paint_box(scene, face, eye, dx, dy, slope, index):
-    """A box's face, and its top where it is seen from above."""
+    """Paint a box's face, and its top where it is visible from above."""
     world = scene.world
     top, owner = world.top[face], world.owner[face]
     if top < eye[2]:
         at = np.flatnonzero(slope < 0)
         reach = np.float32(top - eye[2]) / slope[at]
         point = np.stack([eye[0] + reach * dx[at], eye[1] + reach * dy[at]], -1)
-        index[at[outside(world.boxes[owner], point).max(-1) < 0]] = scene.tops + owner
-    height, found = _meet(scene, face, eye, dx, dy, slope)
-    np.copyto(index, found + np.int32(scene.face[face]), where=(height >= 0) & (height < top))
+        index[at[distance_outside(world.boxes[owner], point).max(-1) < 0]] = scene.tops + owner
+    height, texel = _intersect(scene, face, eye, dx, dy, slope)
+    np.copyto(index, texel + np.int32(scene.face[face]), where=(height >= 0) & (height < top))
 
 
 def expose(scene, rays, eye, heading, light=1.0):
-    """Image float32 [H, W, 3] of 0..1, with `light` [P, 3] (or 1) on the scene's pixels."""
-    colours = np.empty((len(rays.place), 4), np.uint8)
-    colours[rays.place] = cast(scene, rays, eye, heading)
+    """Make the image float32 [H, W, 3] of 0..1, with `light` [P, 3] (or 1) on the scene."""
+    colours = np.empty((len(rays.flat_index), 4), np.uint8)
+    colours[rays.flat_index] = cast(scene, rays, eye, heading)
     colours = colours.reshape(len(rays.pixel), -1, 4)
     mean = colours.sum(axis=1, dtype=np.uint16)[:, :3] * np.float32(1 / 255 / colours.shape[1])
     image = rays.dark.copy()

@@ -1,8 +1,8 @@
-"""What the surfaces of the rendered room look like: paint, grain, light; all baked into textures.
+"""Textures of the rendered room's surfaces: paint and grain, with light baked in.
 
-A texture is float32 [columns, rows, 3] while it is painted, blue, green, red in 0..1 as a video
+While it is painted, a texture is float32 [columns, rows, 3], blue, green, red in 0..1 as a video
 signal: columns along the surface, rows upwards, `TEXEL` m each. Edges lie on texel borders, so that
-a nearest look-up is sharp exactly where the geometry says.
+a nearest-neighbour look-up is sharp exactly at the edge.
 """
 
 import cv2
@@ -12,8 +12,8 @@ TEXEL = 0.005  # m, vertical surfaces
 FLAT_TEXEL = 0.01  # m, floor and ceiling
 TILE = 0.30  # m, the floor's tiles as in the paper's room
 PANEL = 0.60  # m, the ceiling's panels
-AMBIENT, LAMP = 0.76, 2.0  # light from everywhere, and of one lamp at 1 m face to face
-SHINING = 1.0  # added to what shines by itself: paint is below it, and takes the room's light
+AMBIENT, LAMP = 0.76, 2.0  # ambient light, and that of one lamp at 1 m head-on
+EMISSIVE = 1.0  # added to emissive texels: paint is below it, and is lit by the room's light
 FRAME = 0.06  # m, the width of door and window frames
 
 WALL = ((0.80, 0.85, 0.86), (0.74, 0.82, 0.84), (0.84, 0.84, 0.80), (0.72, 0.80, 0.76))
@@ -26,27 +26,27 @@ def texels(length, size=TEXEL):
     return round(length / size)
 
 
-def blank(length, height, colour, size=TEXEL):
+def blank_texture(length, height, colour, size=TEXEL):
     texture = np.empty((texels(length, size), texels(height, size), 3), np.float32)
     texture[:] = colour
     return texture
 
 
 def smooth_noise(rng, shape, columns, rows):
-    """Smooth noise of unit variance [shape] with so many bumps along columns and rows."""
+    """Draw smooth noise of unit variance [shape], with `columns` x `rows` bumps."""
     coarse = rng.standard_normal((max(2, round(columns)), max(2, round(rows)))).astype(np.float32)
     return cv2.resize(coarse, shape[1::-1], interpolation=cv2.INTER_CUBIC)
 
 
 def plaster(rng, texture):
-    """Uneven paint: nothing sharper than a decimetre."""
+    """Make the paint uneven, on scales above a decimetre."""
     wide, high = np.array(texture.shape[:2]) * TEXEL
     texture *= 1 + 0.012 * smooth_noise(rng, texture.shape, wide / 0.15, high / 0.15)[..., None]
     texture *= 1 + 0.015 * smooth_noise(rng, texture.shape, wide / 0.8, high / 0.8)[..., None]
 
 
 def grain(rng, texture, strength=0.05):
-    """Wood: streaks along the height, bent a little."""
+    """Add the grain of wood: slightly bent streaks along the height."""
     wide, high = np.array(texture.shape[:2]) * TEXEL
     fine = smooth_noise(rng, texture.shape, wide / 0.012, high / 0.7)
     broad = smooth_noise(rng, texture.shape, wide / 0.06, high / 1.2)
@@ -54,7 +54,7 @@ def grain(rng, texture, strength=0.05):
 
 
 def paint(texture, left, right, bottom, top, colour, size=TEXEL):
-    """Fill a rectangle (m, from the surface's lower start) and return it as a view."""
+    """Fill a rectangle (m, from the surface's lower start corner) and return it as a view."""
     part = texture[
         texels(left, size) : texels(right, size), texels(bottom, size) : texels(top, size)
     ]
@@ -63,7 +63,7 @@ def paint(texture, left, right, bottom, top, colour, size=TEXEL):
 
 
 def door(rng, texture, left, width, height, colours):
-    """A leaf in a frame; returns where its vertical edges are."""
+    """Paint a leaf in a frame; returns its vertical edges (along, bottom, top)."""
     frame, leaf = colours
     right = left + width
     paint(texture, left, right, 0, height, frame)
@@ -76,7 +76,7 @@ def door(rng, texture, left, width, height, colours):
 
 
 def window(rng, texture, left, width, bottom, top, frame):
-    """Two bright panes in a frame; returns where their vertical edges are."""
+    """Paint two bright panes in a frame; returns their vertical edges."""
     right, middle = left + width, round(left + width / 2, 2)
     paint(texture, left, right, bottom, top, frame)
     panes = [(left + FRAME, middle - FRAME / 2), (middle + FRAME / 2, right - FRAME)]
@@ -85,13 +85,13 @@ def window(rng, texture, left, width, bottom, top, frame):
         height = np.linspace(0, 1, pane.shape[1], dtype=np.float32)
         trees = np.clip(3 * (0.35 + 0.04 * smooth_noise(rng, pane.shape, 5, 2) - height), 0, 1)
         pane *= 1 - 0.45 * trees[..., None] * np.array([0.9, 0.5, 0.8], np.float32)
-        pane += SHINING
+        pane += EMISSIVE
     inner = [(s, bottom + FRAME, top - FRAME) for pair in panes for s in pair]
     return [(left, bottom, top), (right, bottom, top), *inner]
 
 
 def picture(rng, texture, left, width, bottom, top, colour):
-    """A print of soft shapes; returns where its vertical edges are."""
+    """Paint a print of soft shapes; returns its vertical edges."""
     part = paint(texture, left, left + width, bottom, top, colour)
     for channel in range(3):
         part[..., channel] *= 1 + 0.18 * smooth_noise(rng, part.shape, 5, 6)
@@ -102,7 +102,7 @@ def picture(rng, texture, left, width, bottom, top, colour):
 
 
 def board(rng, texture, left, width, bottom, top):
-    """A whiteboard with some lines of writing; returns where its vertical edges are."""
+    """Paint a whiteboard with lines of writing; returns its vertical edges."""
     part = paint(texture, left, left + width, bottom, top, (0.97, 0.97, 0.96))
     for row in range(20, part.shape[1] - 20, 24):
         begin, end = np.sort(rng.integers(20, part.shape[0] - 20, 2))
@@ -113,7 +113,7 @@ def board(rng, texture, left, width, bottom, top):
 
 
 def cupboard(rng, texture, colour):
-    """Doors side by side, one darker; returns where their borders are."""
+    """Paint two doors side by side, one darker; returns their vertical edges."""
     wide, high = np.array(texture.shape[:2]) * TEXEL
     texture[:] = colour
     grain(rng, texture, 0.04)
@@ -128,7 +128,7 @@ def cupboard(rng, texture, colour):
 
 
 def drawers(rng, texture, colour):
-    """Drawers, one above the other: no vertical edges of their own."""
+    """Paint drawers, one above the other; they have no vertical edges."""
     wide, high = np.array(texture.shape[:2]) * TEXEL
     texture[:] = colour
     grain(rng, texture, 0.03)
@@ -139,7 +139,7 @@ def drawers(rng, texture, colour):
 
 
 def shelf(rng, texture, colour):
-    """Boards with files and books; returns where the vertical edges of those are."""
+    """Paint boards with files and books; returns their vertical edges."""
     wide, high = np.array(texture.shape[:2]) * TEXEL
     edges = []
     texture[:] = np.multiply(colour, 0.35)
@@ -156,8 +156,9 @@ def shelf(rng, texture, colour):
 
 
 def floor(rng, width, depth):
-    """Plastic tiles, no two quite alike."""
-    texture = blank(width, depth, rng.choice([(0.46, 0.53, 0.58), (0.55, 0.55, 0.52)]), FLAT_TEXEL)
+    """Make a floor of plastic tiles in varying shades."""
+    colour = rng.choice([(0.46, 0.53, 0.58), (0.55, 0.55, 0.52)])
+    texture = blank_texture(width, depth, colour, FLAT_TEXEL)
     x, y = (np.arange(n) * FLAT_TEXEL // TILE for n in texture.shape[:2])
     shade = 1 + 0.06 * (((x[:, None] + y) % 2) - 0.5) * rng.uniform(0, 2)
     shade += (
@@ -173,19 +174,19 @@ def floor(rng, width, depth):
 
 
 def ceiling(width, depth, lamps, size):
-    """Panels and lamps."""
-    texture = blank(width, depth, (0.66, 0.68, 0.68), FLAT_TEXEL)
+    """Make a ceiling of panels and lamps."""
+    texture = blank_texture(width, depth, (0.66, 0.68, 0.68), FLAT_TEXEL)
     for axis in (0, 1):
         joint = np.arange(texture.shape[axis]) % texels(PANEL, FLAT_TEXEL) == 0
         texture[joint if axis == 0 else (slice(None), joint)] *= 0.85
     for x, y in lamps:
         a, b = size[0] / 2, size[1] / 2
-        paint(texture, x - a, x + a, y - b, y + b, SHINING + 1, FLAT_TEXEL)
+        paint(texture, x - a, x + a, y - b, y + b, EMISSIVE + 1, FLAT_TEXEL)
     return texture
 
 
-def lit(point, normal, lamps, height):
-    """Light [...] at points [..., 3] of a surface with this normal, of lamps on the ceiling."""
+def light_on(point, normal, lamps, height):
+    """Light [...] of lamps on the ceiling at points [..., 3] of a surface with this normal."""
     light = np.full(point.shape[:-1], AMBIENT)
     for x, y in lamps:
         to = np.array([x, y, height]) - point
@@ -196,15 +197,15 @@ def lit(point, normal, lamps, height):
 
 
 def bake(texture, point, normal, lamps, height, near, shadows):
-    """A surface's paint in the room's light, uint8.
+    """Bake the room's light into a texture; returns uint8.
 
-    `point` [n, m, 3] is a coarse grid over it, `near` [n, m] the distance to the nearest thing that
-    keeps light away; both are soft, so that light makes no edges.
+    `point` [n, m, 3] is a coarse grid over the surface, `near` [n, m] the distance to the nearest
+    other surface, which keeps light away; light is interpolated, so that it makes no edges.
     """
-    light = lit(point, normal, lamps, height)
+    light = light_on(point, normal, lamps, height)
     light *= 1 - 0.30 * shadows * np.exp(-near / 0.20)
     light = cv2.resize(light.astype(np.float32), texture.shape[1::-1])[..., None]
-    seen = np.where(texture > SHINING, texture - SHINING, np.minimum(texture, 1) * light)
+    seen = np.where(texture > EMISSIVE, texture - EMISSIVE, np.minimum(texture, 1) * light)
     return np.rint(255 * np.clip(seen, 0, 1)).astype(np.uint8)
 
 

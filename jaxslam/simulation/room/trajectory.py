@@ -1,7 +1,7 @@
-"""How the rendered room is driven: stop, capture, translate, turn; by command alone.
+"""Drive through the rendered room: stop, capture, translate, turn.
 
-A driver who watches the robot steers it round the room; the log knows only the commands, while
-wheels slip: the truth falls short of them. Metres, radians (CCW).
+A driver who sees the robot steers it round the room. The log has only the commands, of which the
+truth falls short, since wheels slip. Metres, radians (CCW).
 """
 
 from math import atan2, ceil, cos, hypot, pi, sin
@@ -11,34 +11,34 @@ import numpy as np
 
 from jaxslam.simulation.room.geometry import DEPTH, WIDTH
 
-RADIUS = 0.25  # m, of a Pioneer-DX3
+RADIUS = 0.25  # m, of the robot (Pioneer-DX3)
 ASIDE = 0.90  # m between the loop and the long walls
-CORNER = 0.5  # m, the loop's corners' radius
-LAP = 20.0  # m round the loop, so that 60 m are three rounds and end near the start
-SWAY = 0.04  # m: no two rounds are quite the same
+CORNER = 0.5  # m, radius of the loop's corners
+LAP = 20.0  # m round the loop: 60 m are three rounds and end near the start
+SWAY = 0.04  # m, amplitude of the deviation from the loop, different in each round
 TURN = pi / 18  # rad from stop to stop when turning on the spot
-LANE = 8.0  # m, the longest straight drive
+LANE = 8.0  # m, length of the straight path
 LENGTH = {"loop": 60.0, "straight": 6.0, "turn": 2 * pi}  # m, m, rad
 
 
 class Drive(NamedTuple):
-    """True poses [n + 1, 3] at the stops, and the commands [n, 2] between: distance, then turn."""
+    """True poses [n + 1, 3] at the stops and commands [n, 2] between: distance, then turn."""
 
     pose: np.ndarray
     command: np.ndarray
 
 
 def stop_and_go(
-    kind="loop",  # loop: round and round; straight: along a wall; turn: on the spot
+    kind="loop",  # loop: round the room; straight: along a wall; turn: on the spot
     seed=0,
     *,
     step=0.2,  # m commanded from stop to stop
-    length=None,  # m truly driven, at least (turn: rad commanded); None: 60, 6, a whole turn
-    slip=0.025,  # mean of the share of a distance that is lost, drawn anew every step
+    length=None,  # m truly driven, at least (turn: rad commanded); None: 60, 6, 2 pi
+    slip=0.025,  # mean fraction of distance lost by slip, drawn for every step
     turn_error=0.02,  # standard deviation of a turn's relative error
-    drift=0.01,  # rad/sqrt m, by which the heading strays when driving
+    drift=0.01,  # rad/sqrt m, drift of the heading when driving
 ):
-    """A `Drive` through any furnished room: furniture keeps off its path. Raises `ValueError`."""
+    """Draw a `Drive`; furniture never stands on its path. Raises `ValueError`."""
     _check(kind, step, length, slip, turn_error, drift)
     length = LENGTH[kind] if length is None else length
     rng = np.random.default_rng([seed, 1])
@@ -54,23 +54,23 @@ def stop_and_go(
             distance, turn = step, _steer(path, at, pose[-1], step)
         commands.append((distance, turn))
         lost = rng.uniform(0, 2 * slip)
-        strayed = drift * distance**0.5 * rng.standard_normal()
+        drifted = drift * distance**0.5 * rng.standard_normal()
         turned = turn * (1 + turn_error * rng.standard_normal())
-        pose.append(_move(pose[-1], distance * (1 - lost), strayed, turned))
+        pose.append(_move(pose[-1], distance * (1 - lost), drifted, turned))
         done += turn if kind == "turn" else distance * (1 - lost)
     return Drive(np.array(pose), np.array(commands))
 
 
-def _move(pose, distance, strayed, turned):
-    """True pose after a step whose heading strays evenly over the distance, before it turns."""
+def _move(pose, distance, drifted, turned):
+    """True pose after a step whose heading drifts evenly over the distance, before it turns."""
     x, y, heading = pose
-    along = heading + strayed / 2
-    heading = (heading + strayed + turned + pi) % (2 * pi) - pi
+    along = heading + drifted / 2
+    heading = (heading + drifted + turned + pi) % (2 * pi) - pi
     return x + distance * cos(along), y + distance * sin(along), heading
 
 
 def _steer(path, at, pose, step):
-    """The turn after the next translation that makes for the path one step further on."""
+    """Turn after the next translation, towards the path one step further on."""
     x, y, heading = pose
     x, y = x + step * cos(heading), y + step * sin(heading)
     goal = path[min(at + round(2 * step / SPACING), len(path) - 1)]
@@ -83,19 +83,19 @@ SPACING = 0.01  # m between the points of a path
 
 
 def _nearest(path, at, pose):
-    """Index of the path's point nearest to the robot, from the last one forwards."""
+    """Index of the path's nearest point to the robot, searching forwards from the last."""
     window = path[at : at + 150]
     return at + int(np.argmin(np.hypot(*(window - pose[:2]).T)))
 
 
 def _lane(length):
-    """A straight path [n, 2] along the south wall, with a little to steer by beyond its end."""
+    """Straight path [n, 2] along the south wall, a little longer than driven, to steer by."""
     x = np.arange(ceil((length + 0.5) / SPACING)) * SPACING + (WIDTH - LANE) / 2
     return np.column_stack([x, np.full(len(x), ASIDE + 0.1)])
 
 
 def _loop(rng, length):
-    """Rounds [n, 2] on a rounded rectangle from anywhere on its south side, each swaying a bit."""
+    """Path [n, 2] round a rounded rectangle, from anywhere on its south side, with `SWAY`."""
     deep = DEPTH - 2 * ASIDE - 2 * CORNER
     wide = (LAP - 2 * pi * CORNER) / 2 - deep
     at = (rng.uniform(0.1, 0.5) * wide + np.arange(ceil((length + 1) / SPACING)) * SPACING) % LAP
@@ -105,7 +105,7 @@ def _loop(rng, length):
     piece = np.searchsorted(begins, at, side="right") - 1
     into, quarter = at - begins[piece], piece // 2
     curved = piece % 2 == 1
-    # on a quarter: straight ahead, then a bend to the left about its centre
+    # Each quarter: straight ahead, then a bend to the left about its centre.
     turned = np.where(curved, into / CORNER, 0.0)
     side = np.where(quarter % 2 == 0, wide, deep)
     ahead = np.where(curved, side + CORNER * np.sin(turned), into) - side / 2

@@ -1,4 +1,7 @@
-"""Which error model of the sensor the data prefer: each is learnt, and judged on held-out logs.
+"""Which error model of the sensor the data prefer: each is learned, and judged on held-out logs.
+
+    python experiments/error_models.py lost-in-the-woods --end 600 --held-out lost-in-the-woods \\
+        --held-out-start 600 --association known --spacing 1
 
 The paper takes a measurement for a 2-D normal point. Alternatives for what is measured as range
 and bearing, or bearing alone: normal; normal sideways noise that is the larger the nearer (what is
@@ -6,27 +9,33 @@ seen has a size: `landmark_extent`); either with a share `outlier` of measuremen
 (heavy-tailed). Evidences of one log are comparable only as densities of the same thing: that of a
 point (x, y) is per m^2, that of (range, bearing) per m rad, and r times as large, since
 dx dy = r dr dbearing. The sum of log r over the measurements is added to the former.
-Of a point's covariance only the scale is learnt: it is made with the noise that the fit began with.
+Of a point's covariance only the scale is learned: it is made with the noise that the fit began with.
 """
 
+import argparse
 import dataclasses
+import sys
 from typing import NamedTuple
 
 import numpy as np
 
+from jaxslam.config import ASSOCIATIONS
 from jaxslam.filter.frames import frames_from_log
 from jaxslam.learning import fit
-from jaxslam.parameters import MOTION, TABLE
+from jaxslam.learning.data import config_for_logs, split_log
+from jaxslam.logs.log_file import load_log
+from jaxslam.parameter_file import load_params
+from jaxslam.parameters import MOTION, TABLE, default_params
 
 FRESH = 8  # seeds that judge
-GROWTH = 0.02  # m: where growth starts if it is 0; its logarithm is learnt
+GROWTH = 0.02  # m: where growth starts if it is 0; its logarithm is learned
 OUTLIER = 0.01
 SURE = 3.0  # standard errors of a difference, from which on it is a preference
 NAMES = ("normal", "range_dependent", "heavy_tailed", "heavy_tailed+range_dependent", "point")
 
 
 class Judged(NamedTuple):
-    """A model: parameters `values` learnt, and log `evidence` [seeds] of `count` held-out
+    """A model: parameters `values` learned, and log `evidence` [seeds] of `count` held-out
     measurements, per m rad (bearings alone: per rad)."""
 
     model: str
@@ -43,7 +52,7 @@ class Judged(NamedTuple):
 def compare(train, held_out, config, params, names=(), seeds=4, steps=150, seed=0, progress=None):
     """A `Judged` per model: lists of `Log`s to learn from and to judge by.
 
-    Of `names` the motion's are learnt with each model; `params` are where all start. `progress`:
+    Of `names` the motion's are learned with each model; `params` are where all start. `progress`:
     called with (models done, models). Raises `ValueError` for sensor `position`, whose points have
     no range and bearing to be compared by.
     """
@@ -83,7 +92,7 @@ def _judged(model, train, held_out, config, params, names, seeds, steps, seed):
         train, held_out = ([_without_points(log) for log in logs] for logs in (train, held_out))
     names = (*(name for name in names if MOTION in TABLE[name].learned_by), *own)
     found = fit.fit(train, config, start, names, held_out, seeds=seeds, steps=steps, seed=seed)
-    # Positions are made with the noise they were learnt with, whose scale is then the fit's.
+    # Positions are made with the noise they were learned with, whose scale is then the fit's.
     evidence = fit.evidence(held_out, config, found.params, FRESH, seed + 7919)
     used = [_ranges(log, config, start) for log in held_out]
     if model == "point":
@@ -99,8 +108,7 @@ def _without_points(log):
 
 def _ranges(log, config, params):
     """Ranges [n] of the measurements that find a slot (ones, where none was measured)."""
-    known = config.association == "known"
-    row = frames_from_log(log, config.sensor, config.measurements, params, known).row
+    row = frames_from_log(log, config, params).row
     ranges = np.ones(len(log.frame)) if log.range is None else log.range
     return ranges[row[row >= 0]]
 
@@ -108,7 +116,7 @@ def _ranges(log, config, params):
 def table(rows):
     """Text: a line per model, the best first."""
     rows = sorted(rows, key=lambda row: -_mean(row))
-    lines = [f"{'error model':30}{'held-out evidence':>24}{'to the best':>16}  learnt"]
+    lines = [f"{'error model':30}{'held-out evidence':>24}{'to the best':>16}  learned"]
     for row in rows:
         told = f"{np.mean(row.evidence):.2f} ± {np.std(row.evidence, ddof=1):.2f}"
         behind = f"{_mean(row) - _mean(rows[0]):.2f}"
@@ -136,3 +144,62 @@ def preferred(rows):
 def _mean(row):
     """Mean evidence; what is not finite comes last."""
     return float(np.mean(row.evidence)) if row.finite else -np.inf
+
+
+def arguments(description):
+    """The arguments of an experiment that learns from logs, as those of `jaxslam learn`."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("logs", nargs="+", help="logs to learn from")
+    parser.add_argument("--held-out", nargs="+", default=[], help="logs to judge by")
+    for option in ("--start", "--held-out-start", "--spacing"):
+        parser.add_argument(option, type=float, default=0.0, metavar="SECONDS")
+    for option in ("--end", "--held-out-end"):
+        parser.add_argument(option, type=float, metavar="SECONDS")
+    parser.add_argument("--window", type=float, default=60.0, metavar="SECONDS")
+    parser.add_argument("--sensor")
+    parser.add_argument("--association", choices=ASSOCIATIONS, default="sampled")
+    parser.add_argument("--params", help="TOML file of starting values")
+    parser.add_argument("--parameters", help="what to learn, separated by commas")
+    for option, default in (("particles", 200), ("seeds", 4), ("steps", 150), ("seed", 0)):
+        parser.add_argument(f"--{option}", type=int, default=default)
+    return parser
+
+
+def prepare(given):
+    """Windows to learn from and to judge by, `Config`, starting `Params` and names to learn."""
+    sides = (given.logs, given.start, given.end), (
+        given.held_out, given.held_out_start, given.held_out_end
+    )  # fmt: skip
+    known = given.association == "known"
+    train, held_out = (
+        [
+            part
+            for name in names
+            for part in split_log(load_log(name), start, end, given.window, given.spacing, known)[0]
+        ]
+        for names, start, end in sides
+    )
+    config, _ = config_for_logs(train + held_out, given.sensor, given.association, given.particles)
+    params = default_params(config.sensor, train[0])
+    params = load_params(given.params, params) if given.params else params
+    if given.parameters:
+        return train, held_out, config, params, tuple(given.parameters.split(","))
+    names = fit.default_names(config)
+    names = (n for n in names if getattr(params, n) > 0 or TABLE[n].scale == "linear")
+    return train, held_out, config, params, tuple(names)
+
+
+def main():
+    given = arguments(__doc__.splitlines()[0]).parse_args()
+    if not given.held_out:
+        sys.exit("error_models.py: add --held-out logs to compare by")
+    rows = compare(
+        *prepare(given), given.seeds, given.steps, given.seed,
+        lambda done, total: print(f"model {done + 1} of {total}", file=sys.stderr),
+    )  # fmt: skip
+    print(f"{table(rows)}\n{preferred(rows)}")
+    return int(any(not row.finite for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,19 +1,25 @@
-"""The log likelihood over a grid of two parameters, with the way a fit took: `surface.png`."""
+"""The log likelihood over a grid of two parameters, with the path that a fit took.
+
+    python experiments/likelihood_surface.py lost-in-the-woods --end 300 --association known \\
+        --spacing 1 --over err_rot err_drift --out surface.png
+"""
 
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
+from error_models import arguments, prepare
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from jaxslam.filter import sharding
 from jaxslam.learning import fit as learn
-from jaxslam.learning import likelihood, transforms
-from jaxslam.learning.report import KNOWN, estimates, fit_axis
+from jaxslam.learning import likelihood, transforms, uncertainty
+from jaxslam.learning.report import KNOWN, estimates, fit_axis, save_figure
 from jaxslam.parameters import TABLE, Params
 from jaxslam.plotting import LANDMARK, RECKONING, STYLE, ellipses
 
@@ -36,7 +42,7 @@ class Surface(NamedTuple):
 
 
 def surface(logs, fit, errors, pair, seeds=2, seed=0, progress=None):
-    """`Surface` of a pair of the learnt parameters around the path and the estimate.
+    """`Surface` of a pair of the learned parameters around the path and the estimate.
 
     The same random numbers everywhere: neighbours then differ by less than seeds do. `progress`:
     called with (columns done, columns).
@@ -127,3 +133,26 @@ def _draw_path(axes, found, fit, errors, where):
         return
     outline = ellipses(at[None], [[cov[0, 0], cov[0, 1], cov[1, 1]]], sigmas=1.0)[0]
     axes.plot(*own(outline), color=LANDMARK, lw=1.5, label=r"1 $\sigma$", path_effects=lined)
+
+
+def main():
+    parser = arguments(__doc__.splitlines()[0])
+    parser.add_argument("--over", nargs=2, required=True, metavar="PARAMETER")
+    parser.add_argument("--out", type=Path, default=Path("surface.png"))
+    given = parser.parse_args()
+    train, held_out, config, params, names = prepare(given)
+    if len(set(given.over)) != 2 or not set(given.over) <= set(names):
+        parser.error(f"--over {' '.join(given.over)}: must be two of {', '.join(names)}")
+    fit = learn.fit(
+        train, config, params, names, held_out, seeds=given.seeds, steps=given.steps,
+        seed=given.seed,
+    )  # fmt: skip
+    errors = uncertainty.assess(fit, train, seed=given.seed + 1)
+    fit = uncertainty.improve(fit, errors)
+    found = surface(train, fit, errors, given.over, seed=given.seed + 2)
+    save_figure(draw_surface(found, fit, errors), given.out)
+    print(given.out)
+
+
+if __name__ == "__main__":
+    main()

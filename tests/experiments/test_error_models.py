@@ -2,13 +2,14 @@
 
 import dataclasses
 
+import error_models
 import numpy as np
 import pytest
+from error_models import NAMES, Judged, compare, model_of, preferred, table
 
 from jaxslam.config import Config
-from jaxslam.learning import error_models, transforms
 from jaxslam.learning import fit as learn
-from jaxslam.learning.error_models import NAMES, Judged, compare, model_of, preferred, table
+from jaxslam.learning import transforms
 from jaxslam.parameters import default_params
 from jaxslam.runs.run import config_for
 from jaxslam.simulation import planar
