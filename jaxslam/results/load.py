@@ -27,7 +27,8 @@ def load_result(directory: str | Path, log: str | Path | None = None) -> Result:
     directory = Path(directory)
     try:
         settings = tomllib.loads((directory / "run.toml").read_text(encoding="utf-8"))
-        config, params = Config.from_dict(settings["config"]), Params(**current_names(settings["params"]))
+        config = Config.from_dict(settings["config"])
+        params = Params(**current_names(settings["params"]))
         summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
         with (
             open(directory / "steps.npz", "rb") as file,

@@ -25,7 +25,6 @@ from jaxslam.parameter_file import validate
 from jaxslam.parameters import Params
 from jaxslam.results import run_folder
 from jaxslam.results.events import association_entropy
-from jaxslam.results.tables import format_table
 from jaxslam.runs import compiled, memory
 from jaxslam.runs import run as runner
 from jaxslam.runs.assemble import RunProgress, assemble_result
@@ -216,7 +215,11 @@ def format_runs(found):
             for label, of in (("mean", np.mean), ("sd", partial(np.std, ddof=1))):
                 summary = {name: of(values) for name, values in columns.items()}
                 lines.append([label, *told, *_cells(summary, shown)])
-    return format_table(lines)
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join(
+        "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
+        for line in lines
+    )
 
 
 def _value(value):
