@@ -10,6 +10,7 @@ from its beginning; there `summary.json` appears last.
 import json
 import os
 import shutil
+from contextlib import contextmanager
 from dataclasses import fields
 from importlib.metadata import PackageNotFoundError, version
 from math import cos, isfinite, sin
@@ -53,19 +54,12 @@ def save(result, directory, overwrite=False, log_source=None, figures=True):
     directory = Path(directory)
     check_target(directory, overwrite)
     target = directory.resolve()
-    try:
+    partial = temporary_sibling(target)
+    with _writing(directory, partial):
         target.parent.mkdir(parents=True, exist_ok=True)
-        partial = temporary_sibling(target)
         partial.mkdir()
-    except OSError as error:
-        raise _write_error(directory, error) from error
-    try:
         _write_files(result, partial, _log_reference(log_source, target), figures)
         move_folder(partial, target, overwrite)
-    except OSError as error:
-        raise _write_error(directory, error) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def save_into(result, directory, log_source=None):
@@ -77,7 +71,7 @@ def save_into(result, directory, log_source=None):
     directory = Path(directory)
     partial = directory / PARTIAL
     clear_results(directory)
-    try:
+    with _writing(directory, partial):
         partial.mkdir()
         _write_files(result, partial, _log_reference(log_source, directory.resolve()))
         for path in sorted(partial.iterdir(), key=lambda path: path.name == FINISHED):
@@ -85,10 +79,6 @@ def save_into(result, directory, log_source=None):
                 fsync_all(directory)
             os.replace(path, directory / path.name)
         fsync_all(directory)
-    except OSError as error:
-        raise _write_error(directory, error) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def clear_results(directory):
@@ -105,17 +95,13 @@ def check_target(directory, overwrite=False, resume=False):
     is writing there.
     """
     directory = Path(directory)
-    try:
+    with _writing(directory):
         if directory.exists() or directory.is_symlink():
             run_lock.check_unlocked(directory)
             _check_existing(directory, overwrite, resume)
         parent = next(path for path in directory.resolve().parents if path.exists())
         if not parent.is_dir() or not os.access(parent, os.W_OK):
             raise ValueError(f"{directory}: can't be made in {parent}; choose another with --out")
-    except BlockingIOError:
-        raise
-    except OSError as error:
-        raise _write_error(directory, error) from error
 
 
 def _check_existing(directory, overwrite, resume):
@@ -268,13 +254,22 @@ def _log_reference(log_source, target):
     return None if path.is_relative_to(target) else str(path)
 
 
-def _write_error(directory, error):
-    """Return the error to raise for an `OSError` of writing."""
-    if error.errno in NO_SPACE:
-        return OSError(error.errno, error.strerror, str(directory))
-    return ValueError(
-        f"{directory}: can't be written ({error.strerror}); choose another with --out"
-    )
+@contextmanager
+def _writing(directory, partial=None):
+    """Raise an `OSError` within as one that names the folder, as `ValueError` unless space is short
+    or another process is writing; remove `partial` in the end."""
+    try:
+        yield
+    except BlockingIOError:
+        raise
+    except OSError as error:
+        if error.errno in NO_SPACE:
+            raise OSError(error.errno, error.strerror, str(directory)) from error
+        problem = f"can't be written ({error.strerror}); choose another with --out"
+        raise ValueError(f"{directory}: {problem}") from error
+    finally:
+        if partial:
+            shutil.rmtree(partial, ignore_errors=True)
 
 
 def _toml(value):
