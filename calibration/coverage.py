@@ -91,18 +91,6 @@ def bearing_uncertainty(camera, radius):
     return Bearings(*sigma, pixel, float(np.sqrt(np.mean(degrees**2))), float(degrees.max()))
 
 
-def azimuth_error(camera, true, radius):
-    """Azimuth error [n] rad of a camera against the true one, without the common rotation, and its
-    standard deviation [n] by `bearing_uncertainty`, at the same pixels."""
-    stated = bearing_uncertainty(camera, radius)
-    usable = np.isfinite(stated.sigma)
-    pixel = stated.pixel[usable]
-    ray, real = camera.ray(pixel), true.ray(pixel)
-    inside = np.isfinite(real).all(1)
-    error = angle_change(real[inside], (ray - real)[inside, :, None])[0][:, 0]
-    return error, stated.sigma[usable][inside]
-
-
 def list_warnings(corners, names, cover, uncertain):
     """List the weaknesses of a set of boards, in sentences for the user."""
     found = []

@@ -10,7 +10,7 @@ Residuals against the truth are fitted by maximum likelihood with the filter's m
   turns cancel noise. Drive by hand, or without feedback.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -45,7 +45,7 @@ class ErrorModel:
     """`values` of `Params` with `standard_errors`, by name; `counts` by kind; residuals `by_range`.
 
     `interval` s of odometry. `drive_yaw` rad (value, standard error): direction in which the robot
-    drives, relative to its true heading. The filter assumes zero: see `turn_frame`.
+    drives, relative to its true heading. The filter assumes zero.
     """
 
     values: dict[str, float]
@@ -77,16 +77,6 @@ def fit(log, interval=1.0):
     values, errors = ({k: float(v) for k, v in part.items()}
                       for part in (values | driven, errors | uncertain))  # fmt: skip
     return ErrorModel(values, errors, counts, by_range, interval, drive_yaw)
-
-
-def turn_frame(log, yaw):
-    """Turn the robot's frame in a log by `yaw` [rad]: by `drive_yaw`, it then drives along x."""
-    (x, y, heading), c, s = log.mounting, np.cos(yaw), np.sin(yaw)
-    turn, truth = np.array([0, 0, yaw]), log.truth
-    if truth is not None and truth.pose is not None:
-        truth = replace(truth, pose=truth.pose + turn)
-    mounting = c * x + s * y, c * y - s * x, heading - yaw
-    return replace(log, mounting=mounting, start_pose=log.start_pose + turn, truth=truth)
 
 
 def _fit_sensor(log):

@@ -18,10 +18,9 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from simulated_boards import azimuth_error, simulate_boards
 
 from calibration.camera import calibrate_camera, calibrate_corners, cross_validate
-from calibration.coverage import azimuth_error
-from calibration.simulated import simulate_boards
 from jaxslam.simulation.room.render import double_mirror_camera
 
 RESULTS = Path(__file__).parent / "results"

@@ -3,13 +3,13 @@
     python experiments/error_models.py lost-in-the-woods --end 600 --held-out lost-in-the-woods \\
         --held-out-start 600 --association known --spacing 1
 
-The paper takes a measurement for a 2-D normal point. Alternatives for what is measured as range
-and bearing, or bearing alone: normal; normal sideways noise that is the larger the nearer (what is
-seen has a size: `landmark_extent`); either with a share `outlier` of measurements from anywhere in the view
-(heavy-tailed). Evidences of one log are comparable only as densities of the same thing: that of a
-point (x, y) is per m^2, that of (range, bearing) per m rad, and r times as large, since
-dx dy = r dr dbearing. The sum of log r over the measurements is added to the former.
-Of a point's covariance only the scale is learned: it is made with the noise that the fit began with.
+The paper models a measurement as a 2-D normal point. Alternatives for ranges and bearings, or
+bearings alone: normal; bearing noise that grows towards near landmarks, which have a size
+(`landmark_extent`); either with a probability `outlier` of clutter (heavy-tailed). Evidences of one
+log are comparable only as densities of the same quantity: that of a point (x, y) is per m^2, that
+of (range, bearing) per m rad, and r times as large, since dx dy = r dr dbearing. The sum of log r
+over the measurements is added to the former. Of a point's covariance only the scale is learned: it
+is made with the noise at the start of the fit.
 """
 
 import argparse

@@ -144,7 +144,7 @@ def assessed(case, steps, seeds):
         "true_gain_rot": [
             fit_odometry(log, case.spacing)[0].get("gain_rot") for log in case.train
         ],
-        "made": found.made, "log_z_sd": found.log_z_sd, "seconds": fit.seconds,
+        "made": found.covariance_method, "log_z_sd": found.log_z_sd, "seconds": fit.seconds,
         "steps": fit.steps, "unresolved": list(found.unresolved),
         "evidence": {
             name: learn.evidence(judged, fit.config, params, len(seeds), 77).tolist()

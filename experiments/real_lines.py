@@ -13,11 +13,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from line_halves import halves
 
 from calibration.tilt import camera_with_tilt, find_tilt
 from jaxslam.vision.camera_files import load_camera
 from jaxslam.vision.images import read_image
-from jaxslam.vision.lines import extract_lines, halves
+from jaxslam.vision.lines import extract_lines
 from jaxslam.vision.overlay import draw_lines
 from jaxslam.vision.panorama import panorama, unwrap
 

@@ -8,16 +8,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cyclopts import Parameter
+from cyclopts import Group, Parameter
 
 from jaxslam.cli.common import (
     DEMO,
-    End,
     LogName,
-    Overwrite,
-    Seed,
-    Sensor,
-    Start,
+    Sensors,
     at_least,
     check_new,
     note,
@@ -27,56 +23,79 @@ from jaxslam.cli.common import (
 )
 from jaxslam.config import ASSOCIATIONS
 
-HeldOut = Annotated[
-    list[str],
-    Parameter(help="logs to judge by, not to learn from", consume_multiple=True, negative=()),
-]
 FRESH = 8  # seeds that judge
 CHECKPOINT = "learn.checkpoint.npz"
-EVERY = 10  # steps between two lines of progress, where there is no terminal
+EVERY = 10  # steps between two lines of progress without a terminal
+PARTS = Group("Which parts of the logs are used", sort_key=1)
+EFFORT = Group("Filter and optimization", sort_key=2)
+
+
+def _in(group, kind):
+    """The option, listed under a group of the help."""
+    return Annotated[kind, Parameter(group=group)]
 
 
 def learn(
     *logs: LogName,
-    held_out: HeldOut = (),
-    parameters: option(str, "what to learn, by commas (as --params says, or a usual choice)")
+    held_out: Annotated[
+        list[str],
+        Parameter(
+            help="Logs that judge the fit and are not learned from.",
+            consume_multiple=True, negative=(), show_default=False,
+        ),
+    ] = (),
+    parameters: option(
+        str,
+        "Parameters to learn, separated by commas (default: those of --params, else a choice that "
+        "suits the sensor).",
+    ) | None = None,
+    sensor: option(Sensors, "Kind of measurements (default: the first that the log has).")
     | None = None,
-    sensor: Sensor = None,
     association: option(
-        Literal[ASSOCIATIONS], "drawn by particle, believe the log, or the best match (biased)"
+        Literal[ASSOCIATIONS],
+        "Data association: sampled per particle, identities from the log, or the best match, which "
+        "is biased.",
     ) = "sampled",
-    params: option(Path, "TOML file: starting values, and [learn], [bounds], [prior]")
-    | None = None,
-    particles: at_least("how many hypotheses of the path") = 200,
-    landmarks: at_least("slots of the map (64; known: one each)") | None = None,
-    window: option(float, "logs are learnt in pieces so long [s] (0: whole)") = 60.0,
-    spacing: option(
-        float, "use frames at least so far apart [s]: errors of close ones are alike"
+    params: option(
+        Path, "TOML file of starting values, and optionally [learn], [bounds] and [prior]."
+    ) | None = None,
+    out: option(Path, "File of parameters to write (.toml).") = Path("params.toml"),
+    overwrite: option(bool, "Overwrite existing files.") = False,
+    resume: option(bool, "Continue a fit of the same command that was stopped.") = False,
+    seed: at_least("Seed of the random numbers.", 0, 2**32 - 1) = 0,
+    start: _in(PARTS, option(float, "Use the logs from this time on [s after their start].")) = 0.0,
+    end: _in(PARTS, option(float, "Use the logs up to this time [s] (default: all).")) | None
+    = None,
+    held_out_start: _in(PARTS, option(float, "The same for the held-out logs [s].")) = 0.0,
+    held_out_end: _in(PARTS, option(float, "The same for the held-out logs [s].")) | None = None,
+    window: _in(
+        PARTS, option(float, "Length of the windows that logs are split into [s] (0: no split).")
+    ) = 60.0,
+    spacing: _in(
+        PARTS,
+        option(float, "Least time between the frames used [s]: close ones have correlated errors."),
     ) = 0.0,
-    start: Start = 0.0,
-    end: End = None,
-    held_out_start: Start = 0.0,
-    held_out_end: End = None,
-    seeds: at_least("per log and step", 2) = 4,
-    steps: at_least("at most") = 150,
-    seed: Seed = 0,
-    out: option(Path, "the file of parameters to write") = Path("params.toml"),
-    overwrite: Overwrite = False,
-    resume: option(bool, "go on where the same command was stopped") = False,
-):
-    """Learn noise and systematic errors from logged runs, by maximum likelihood.
+    particles: _in(EFFORT, at_least("Number of particles.")) = 200,
+    landmarks: _in(
+        EFFORT, at_least("Slots of the map (default: 64; known association: one per landmark).")
+    ) | None = None,
+    seeds: _in(EFFORT, at_least("Filter runs with different seeds per log and step.", 2)) = 4,
+    steps: _in(EFFORT, at_least("Largest number of optimization steps.")) = 150,
+):  # fmt: skip
+    """Learn noise and systematic errors from logs by maximum likelihood.
 
-    Prints start, estimate, standard error and verdict of every parameter; --out is
-    for jaxslam run --params. learn.csv and learn.png beside it tell of every step.
-    Held-out logs say when to stop and what was won; without them it may learn the
-    noise of this log. The same log may be held out in another part:
+    Prints start, estimate, standard error and verdict of every parameter. Writes
+    the file --out for jaxslam run --params, and beside it learn.csv and learn.png
+    with every step. Held-out logs decide when to stop and show what was gained;
+    without them, noise particular to one log may be learned. They may be other
+    parts of the same log:
 
     Example: jaxslam learn lost-in-the-woods --end 600 --held-out lost-in-the-woods
-    --held-out-start 600 --parameters err_rot,err_drift,gain_rot --out fit/params.toml
+    --held-out-start 600 --parameters err_rot,gain_rot --out fit/params.toml
     """
     files = _files(out, overwrite, resume)
     if not logs:
-        raise ValueError(f"learn: which log? There is {DEMO}, for one")
+        raise ValueError(f"learn: no log given; for example {DEMO}")
     _check_apart(logs, (start, end), held_out, (held_out_start, held_out_end))
     _use_all_cores()
     from jaxslam.learning.data import config_for_logs
@@ -84,20 +103,22 @@ def learn(
     with progress_bar("reading"):
         known = association == "known"
         train = _windows(logs, start, end, window, spacing, known)
-        judges = _windows(held_out, held_out_start, held_out_end, window, spacing, known)
-        config, dropped = config_for_logs(train + judges, sensor, association, particles, landmarks)
+        held_out = _windows(held_out, held_out_start, held_out_end, window, spacing, known)
+        config, dropped = config_for_logs(
+            train + held_out, sensor, association, particles, landmarks
+        )
         task = _task(train, config, params, parameters)
     out.parent.mkdir(parents=True, exist_ok=True)
-    fit = _run_fit(train, judges, config, task, seeds, steps, seed, files, resume)
-    fit, errors, judged = _assess(fit, train, judges, seed)
+    fit = _run_fit(train, held_out, config, task, seeds, steps, seed, files, resume)
+    fit, errors, judged = _assess(fit, train, held_out, seed)
     _write(fit, errors, task, files)
-    found = _print_fit(fit, errors, judged, dropped, files)
+    warned = _print_fit(fit, errors, judged, dropped, files)
     files["checkpoint"].unlink(missing_ok=True)
-    return int(found)
+    return int(warned)
 
 
 def _files(out, overwrite, resume):
-    """Paths of what is written, by name; refuses those that are there."""
+    """Paths of the output files by name; raises `ValueError` for existing ones."""
     folder = out.parent
     if folder.exists():
         check_new(out, overwrite, "a file of parameters", ".toml")
@@ -110,32 +131,33 @@ def _files(out, overwrite, resume):
     files["checkpoint"] = folder / CHECKPOINT
     if files["checkpoint"].exists() and not (overwrite or resume):
         raise ValueError(
-            f"{files['checkpoint']}: a fit was stopped here; --resume goes on, "
-            "--overwrite begins anew"
+            f"{files['checkpoint']}: a fit was stopped here; --resume continues it, "
+            "--overwrite starts anew"
         )
     if resume and not files["checkpoint"].exists():
-        raise ValueError(f"{files['checkpoint']}: is not there; begin without --resume")
+        raise ValueError(f"{files['checkpoint']}: does not exist; start without --resume")
     return files
 
 
 def _check_apart(logs, part, held_out, held_part):
-    """Refuse to judge by what was learnt from."""
+    """Raise `ValueError` if a log is learned from and held out at the same times."""
     far = float("inf")
     (a, b), (c, d) = ((s, far if e is None else e) for s, e in (part, held_part))
     both = {str(Path(log).resolve()) for log in logs} & {str(Path(h).resolve()) for h in held_out}
     if both and max(a, c) < min(b, d):
         name = Path(min(both)).name
         raise ValueError(
-            f"{name}: learnt from and held out; part it by --end and --held-out-start, for example"
+            f"{name}: both learned from and held out; separate the parts, for example by --end and "
+            "--held-out-start"
         )
 
 
 def _use_all_cores():
-    """A device for each core, which the work is shared out over."""
+    """Make every core a device of JAX, over which logs and seeds are distributed."""
     import jax
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    with suppress(RuntimeError):  # a process that has computed already keeps its devices
+    with suppress(RuntimeError):  # JAX is initialized already
         jax.config.update("jax_num_cpu_devices", cores)
 
 
@@ -155,7 +177,7 @@ def _windows(names, start, end, window, spacing, known):
 
 
 def _task(train, config, path, parameters):
-    """`paramfile.Learning`: where to start, what to learn, in which bounds, with which priors."""
+    """`Learning`: starting values, parameters to learn, bounds and priors."""
     from jaxslam.learning import fit, likelihood, transforms
     from jaxslam.parameter_file import Learning, load_learning
     from jaxslam.parameters import TABLE, default_params
@@ -163,53 +185,54 @@ def _task(train, config, path, parameters):
     base = default_params(config.sensor, train[0])
     for log in train:
         if default_params(config.sensor, log) != base:
-            warn(f"{log.name}: declares other values than {train[0].name}, whose are used")
+            warn(f"{log.name}: its declared values differ; those of {train[0].name} are used")
             break
-    told = load_learning(path, base) if path else Learning(base, None, {}, {})
-    start, names = told.params, told.names
+    task = load_learning(path, base) if path else Learning(base, None, {}, {})
+    start, names = task.params, task.names
     if parameters:
         names = tuple(name.strip() for name in parameters.split(","))
-    if names is None:  # what starts at 0 has no logarithm; who wants it learnt names it
+    if names is None:  # a parameter that starts at 0 has no logarithm, so it must be named
         names = fit.default_names(config)
         names = tuple(n for n in names if getattr(start, n) > 0 or TABLE[n].scale == "linear")
     if len(set(names)) < len(names):
         raise ValueError(f"--parameters: {', '.join(names)}; name each once")
-    with _without_clip_warning():
+    with _without_bias_warning():
         likelihood.check(config, names=names)
     if "sigma_bearing" in names and start.extra_bearing_noise:
         note(
-            f"extra_bearing_noise, {start.extra_bearing_noise:g} rad, becomes a part of sigma_bearing: it is learnt"
+            f"extra_bearing_noise, {start.extra_bearing_noise:g} rad, is included in the learned "
+            "sigma_bearing from here on"
         )
-        both = (start.sigma_bearing**2 + start.extra_bearing_noise**2) ** 0.5
-        start = start._replace(sigma_bearing=both, extra_bearing_noise=0.0)
-    transforms.free_vector(start, names)  # refuses a start at 0
-    mine = [
+        sigma = (start.sigma_bearing**2 + start.extra_bearing_noise**2) ** 0.5
+        start = start._replace(sigma_bearing=sigma, extra_bearing_noise=0.0)
+    transforms.free_vector(start, names)  # raises for a start at 0
+    bounds, priors = (
         {name: pair for name, pair in pairs.items() if name in names}
-        for pairs in (told.bounds, told.priors)
-    ]
-    return Learning(start, names, *mine)
+        for pairs in (task.bounds, task.priors)
+    )
+    return Learning(start, names, bounds, priors)
 
 
-def _run_fit(train, judges, config, task, seeds, steps, seed, files, resume):
-    """The fit; a stopped one says how to go on."""
+def _run_fit(train, held_out, config, task, seeds, steps, seed, files, resume):
+    """Run the fit; if stopped, say how to resume it."""
     from jaxslam.learning.fit import fit
 
     try:
-        with _progress_printer("learning") as progress, _without_clip_warning():
+        with _progress_printer("learning") as progress, _without_bias_warning():
             return fit(
-                train, config, task.params, task.names, judges, task.bounds, task.priors,
+                train, config, task.params, task.names, held_out, task.bounds, task.priors,
                 seeds=seeds, steps=steps, seed=seed, checkpoint=files["checkpoint"],
                 resume=resume, progress=progress,
             )  # fmt: skip
     except KeyboardInterrupt:
         if files["checkpoint"].exists():
-            warn("stopped; the same command with --resume goes on from here")
+            warn("stopped; the same command with --resume continues from here")
         raise
 
 
 @contextmanager
-def _without_clip_warning():
-    """No warning of Python's about an association that biases: a line says so in the end."""
+def _without_bias_warning():
+    """Suppress Python's warning of a biased association: a note says so at the end."""
     from jaxslam.learning.likelihood import BIASED
 
     with warnings.catch_warnings():
@@ -219,14 +242,14 @@ def _without_clip_warning():
 
 @contextmanager
 def _progress_printer(what):
-    """A function for the progress of a fit: a bar, or a line now and then."""
+    """Give a function that shows the progress of a fit as a bar, or as lines of text."""
     with progress_bar(what, compiles=True) as show:
         if show:
             show(0, None)
         else:
             print(f"{what}: compiling… (once)", file=sys.stderr)
 
-        def tell(done, total, record):
+        def print_progress(done, total, record):
             values = ", ".join(f"{name} {value:.3g}" for name, value in record["params"].items())
             text = f"loss {record['loss']:.4f}, gradient {record['gradient_norm']:.2g}, {values}"
             if show:
@@ -234,10 +257,10 @@ def _progress_printer(what):
             elif done % EVERY == 0 or done in (1, total):
                 print(f"step {done}/{total}: {text}", file=sys.stderr)
 
-        yield tell
+        yield print_progress
 
 
-def _assess(fit, train, judges, seed):
+def _assess(fit, train, held_out, seed):
     """The fit after a last Newton step, its `Uncertainty`, and what held-out logs say (or None)."""
     from jaxslam.learning.fit import evidence
     from jaxslam.learning.report import Judged
@@ -246,21 +269,21 @@ def _assess(fit, train, judges, seed):
     with progress_bar("standard errors", compiles=True):
         errors = assess(fit, train, seed=seed + 1)
     fit = improve(fit, errors)
-    if not judges:
+    if not held_out:
         return fit, errors, None
-    with progress_bar("judging", compiles=True):
+    with progress_bar("held-out logs", compiles=True):
         fresh = seed + 7919
-        both = (evidence(judges, fit.config, p, FRESH, fresh) for p in (fit.start, fit.params))
+        both = (evidence(held_out, fit.config, p, FRESH, fresh) for p in (fit.start, fit.params))
         return fit, errors, Judged(*both)
 
 
 def _write(fit, errors, task, files):
-    """Write the parameters, the steps' table and their figure."""
+    """Write the parameters, the table of steps and their figure."""
     from jaxslam.learning import report as learn_report
     from jaxslam.parameter_file import save_params
 
     standard = learn_report.standard_errors(errors)
-    # From the free scale and back, a value at its bound may be a rounding beyond it.
+    # Rounding of the free scale may move a value beyond its bound.
     at_bound = {n: min(max(getattr(fit.params, n), a), b) for n, (a, b) in task.bounds.items()}
     params = fit.params._replace(**at_bound)
     with progress_bar("writing"):
@@ -270,7 +293,7 @@ def _write(fit, errors, task, files):
 
 
 def _print_fit(fit, errors, judged, dropped, files):
-    """Print what was found; whether there were warnings."""
+    """Print the results; returns whether there were warnings."""
     from jaxslam.learning import report as learn_report
 
     print(learn_report.table(fit, errors))

@@ -280,7 +280,7 @@ def _check_log_outside(options):
 def run_shared(options, address):
     """Take part in a run of several processes. Ends this process once all have met."""
     from jaxslam.results import run_folder
-    from jaxslam.runs.checkpoints import run_fingerprint
+    from jaxslam.runs.checkpoint_file import run_fingerprint
 
     run = {
         **run_fingerprint(options.log, options.config, options.params, options.seed),

@@ -1,12 +1,12 @@
 """The log likelihood of a log under the filter's model, and its derivatives by `Params`.
 
-The filter's evidence estimates the marginal likelihood Z of the measurements. It jumps as a function
-of the parameters wherever particles are resampled or associations drawn; automatic differentiation
-of the filter ignores these jumps and is biased, whatever the number of particles. The score is
-computed by Fisher's identity instead: the posterior mean of the derivative of log p(path,
-associations, measurements), with path and associations fixed ("frozen"). Every particle carries that
-derivative s as it moves, is weighted and resampled; only sensor parameters need derivatives through
-the landmark EKFs. Forward mode: memory does not grow with the log.
+The filter's evidence estimates the marginal likelihood Z of the measurements. As a function of the
+parameters it jumps wherever particles are resampled or associations drawn; automatic
+differentiation ignores the jumps and is biased, whatever the number of particles. Fisher's identity
+gives the score instead: the posterior mean of the derivative of log p(path, associations,
+measurements), with path and associations fixed ("frozen"). Every particle carries that derivative s
+as it moves, is weighted and resampled; only sensor parameters need derivatives through the landmark
+EKFs. Forward mode: memory does not grow with the log.
 
 The inherited s fades by a `discount` per step: it describes ever fewer distinct ancestors, and its
 contribution to the current step is mostly noise (Poyiadjis, Doucet and Singh 2011; the discount is
@@ -161,9 +161,9 @@ def _derivative(config, primals, tangents):
         if not isinstance(tangent, jax.custom_derivatives.SymbolicZero)
     ]
     names = tuple(name for name in learnable(config) if name in moved)
-    found = score_and_value(params, data, key, config, names, discount)
-    along = [getattr(tangents[0], name) * found.total[i] for i, name in enumerate(names)]
-    return found.log_likelihood, sum(along, jnp.zeros_like(found.log_likelihood))
+    score = score_and_value(params, data, key, config, names, discount)
+    along = [getattr(tangents[0], name) * score.total[i] for i, name in enumerate(names)]
+    return score.log_likelihood, sum(along, jnp.zeros_like(score.log_likelihood))
 
 
 _differentiable.defjvp(_derivative, symbolic_zeros=True)
@@ -303,9 +303,9 @@ def _observe(carry, chance, frame, params, config, through):
     parts = tuple(carry.world)
 
     def observe(values, arrays):
-        given = params._replace(**dict(zip(through, values, strict=True)))
+        replaced = params._replace(**dict(zip(through, values, strict=True)))
         moved = state._replace(landmarks=state.landmarks._replace(**arrays))
-        seen = blocks.observe(moved, chance, *frame, given, config, frozen=True)
+        seen = blocks.observe(moved, chance, *frame, replaced, config, frozen=True)
         return ({name: getattr(seen.landmarks, name) for name in parts}, seen.density), seen
 
     values = tuple(getattr(params, name) for name in through)
@@ -349,7 +349,7 @@ def _frame_score(measurements, params, names):
     values = jnp.array([getattr(params, name) for name in names])
 
     def term(values):
-        given = params._replace(**{name: values[i] for i, name in enumerate(names)})
-        return frame_terms(measurements, given)
+        replaced = params._replace(**{name: values[i] for i, name in enumerate(names)})
+        return frame_terms(measurements, replaced)
 
     return jax.jacfwd(term)(values)

@@ -1,4 +1,4 @@
-"""What was learnt, for people: the table, the sentences below it, `learn.csv` and `learn.png`."""
+"""Report of a fit: the table, the sentences below it, `learn.csv` and `learn.png`."""
 
 import csv
 import io
@@ -16,34 +16,38 @@ from jaxslam.learning.uncertainty import MANY
 from jaxslam.parameters import TABLE
 from jaxslam.plotting import FILTER, LANDMARK, RECKONING, REFINED, STYLE, write_figure
 
-KNOWN = 2.0  # free scale: from here on (a factor of 7) a standard error is without meaning
-MADE = {  # `uncertainty.combined`
-    "both": "products of the scores and their slope agree",
-    "outer": "from products of the scores; their slope is lost in the particles' noise",
-    "sandwich": "products of the scores and their slope disagree, as with a model that is not "
-    "quite right; they are the sandwich of both",
+KNOWN = 2.0  # free scale: standard errors from here on (a factor of 7) are meaningless
+METHODS = {  # `uncertainty.combine_covariances`
+    "both": "outer products and slope of the score agree",
+    "outer": "from outer products of the score; its slope is lost in Monte-Carlo noise",
+    "sandwich": "outer products and slope of the score disagree, as with an inexact model; "
+    "sandwich of both",
 }
-WIDE = 3.0  # an axis from x to this many times x is drawn logarithmic, where that is the free scale
+WIDE = 3.0  # ratio of an axis' ends from which a positive parameter's is logarithmic
 
 
 class Judged(NamedTuple):
-    """Log evidence [seeds] of the held-out logs at the start and at the estimate, by seed."""
+    """Log evidence [seeds] of the held-out logs at the start and at the estimate."""
 
     before: np.ndarray
     after: np.ndarray
 
 
 def table(fit, errors):
-    """Text: a line per parameter, with its start, estimate, errors and verdict."""
+    """Text with a line per parameter: start, estimate, errors and verdict."""
     rows = [("parameter", "start", "estimate", "std error", "Monte Carlo", "unit", "verdict")]
     known = standard_errors(errors)
     for i, name in enumerate(fit.names):
-        told = [f"{getattr(params, name):.4g}" for params in (fit.start, fit.params)]
+        cells = [f"{getattr(params, name):.4g}" for params in (fit.start, fit.params)]
         numbers = (errors.standard_error[i], errors.monte_carlo_error[i])
-        told += [f"{number:.2g}" if name in known else "-" for number in numbers]
-        rows.append((name, *told, TABLE[name].unit, errors.verdict[i]))
+        cells += [f"{number:.2g}" if name in known else "-" for number in numbers]
+        rows.append((name, *cells, TABLE[name].unit, errors.verdict[i]))
+    return _align(rows, "<>>>><<")
+
+
+def _align(rows, align):
+    """Text of rows of cells, in columns that `align` one by one to the left < or the right >."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    align = "<>>>><<"
     return "\n".join(
         "  ".join(f"{cell:{a}{w}}" for cell, a, w in zip(row, align, widths, strict=True)).rstrip()
         for row in rows
@@ -51,13 +55,13 @@ def table(fit, errors):
 
 
 def standard_errors(errors):
-    """Standard errors by name, of those parameters that the log says anything about."""
-    told = zip(errors.names, errors.standard_error, errors.free_error, strict=True)
-    return {name: float(error) for name, error, free in told if free < KNOWN}
+    """Standard errors by name, without those from `KNOWN` on."""
+    columns = zip(errors.names, errors.standard_error, errors.free_error, strict=True)
+    return {name: float(error) for name, error, free in columns if free < KNOWN}
 
 
 def describe(fit, errors, judged=None):
-    """Lines of text: why it ended, held-out evidence, how far the particles are to be trusted."""
+    """Lines of text: reason of the end, held-out evidence, Monte-Carlo errors, unresolved."""
     lines = [f"{fit.stopped} ({fit.steps} steps, {fit.seconds:.0f} s)"]
     if judged is not None:
         gain = judged.after - judged.before
@@ -65,7 +69,7 @@ def describe(fit, errors, judged=None):
             f"held-out evidence: {_spread(judged.before)} before, {_spread(judged.after)} after, "
             f"difference {_spread(gain, '+')} nats ({len(gain)} fresh seeds)"
         )
-    lines.append(f"standard errors: {MADE[errors.made]}")
+    lines.append(f"standard errors: {METHODS[errors.covariance_method]}")
     share = np.max(errors.monte_carlo_error / np.maximum(errors.standard_error, 1e-300))
     lines.append(f"Monte-Carlo error: at most {share:.2g} of a standard error")
     lines.append(f"log Z of one log spreads by {errors.log_z_sd:.2f} nats over seeds")
@@ -80,8 +84,8 @@ def describe(fit, errors, judged=None):
 
 
 def movement(errors, discount):
-    """Which parameter the score with another discount would move most, and by how many standard
-    errors: a Newton step from where the two scores differ."""
+    """Name of the parameter that another discount would move most, and by how many standard errors:
+    a Newton step by the difference of the two scores."""
     change = errors.discounts[discount] - errors.discounts[DISCOUNT]
     step = errors.covariance @ change
     far = np.abs(step) / np.maximum(errors.free_error, 1e-300)
@@ -89,7 +93,7 @@ def movement(errors, discount):
 
 
 def flags(fit, errors, judged=None, dropped=None):
-    """Lines on what went wrong: rows lost, numbers not finite."""
+    """Warnings: measurements not used, numbers not finite."""
     lines = [f"{count} measurements not used: {why}" for why, count in (dropped or {}).items()]
     lost = int((~np.isfinite(fit.history.gradient_norm)).sum())
     if lost:
@@ -103,7 +107,7 @@ def flags(fit, errors, judged=None, dropped=None):
 
 
 def advice(fit, errors, judged=None):
-    """Lines on what to distrust, though nothing was lost."""
+    """Notes on what to distrust."""
     lines = []
     if not errors.log_z_sd <= MANY:
         lines.append(
@@ -111,9 +115,9 @@ def advice(fit, errors, judged=None):
             "more --particles or a shorter --window"
         )
     if judged is None:
-        lines.append("no --held-out log: nothing says whether other logs get more likely, too")
+        lines.append("no --held-out log: whether other logs become more likely is unknown")
     elif not np.mean(judged.after - judged.before) >= 0:
-        lines.append("the held-out logs got less likely: keep what you had")
+        lines.append("the held-out logs became less likely: keep the parameters you had")
     if fit.config.association == "maximum_likelihood":
         lines.append(BIASED)
     return lines
@@ -124,29 +128,29 @@ def _spread(values, sign=""):
 
 
 def save_csv(path, fit):
-    """Write a row per step: what was found before the step moved, and what the held-out logs said
-    after it; `loss` is minus the mean log likelihood per frame."""
-    told = fit.history
-    held = {int(step): i for i, step in enumerate(told.held_out_step)}
+    """Write a row per step: loss, gradient and parameters before the step, held-out evidence after
+    it; `loss` is minus the mean log likelihood per frame."""
+    history = fit.history
+    held = {int(step): i for i, step in enumerate(history.held_out_step)}
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     head = ("step", "loss", "gradient_norm", "rate", *fit.names, "held_out", "held_out_error")
     rows.writerow(head)
-    free = np.reshape(told.free, (-1, len(fit.names)))
+    free = np.reshape(history.free, (-1, len(fit.names)))
     values = np.column_stack([estimates(n, free[:, i]) for i, n in enumerate(fit.names)])
     for s, at in enumerate(values):
         judged = ("", "")
         if s + 1 in held:
             i = held[s + 1]
-            judged = repr(float(told.held_out[i])), repr(float(told.held_out_error[i]))
-        numbers = (-told.log_likelihood[s], told.gradient_norm[s], told.rate[s], *at)
+            judged = repr(float(history.held_out[i])), repr(float(history.held_out_error[i]))
+        numbers = (-history.log_likelihood[s], history.gradient_norm[s], history.rate[s], *at)
         rows.writerow([s + 1, *(f"{float(number):.9g}" for number in numbers), *judged])
     with atomic_write(path) as file:
         file.write(text.getvalue().encode())
 
 
 def estimates(name, free):
-    """A parameter's values for free ones, as NumPy has them."""
+    """Values of a parameter as a NumPy array, from free ones."""
     return np.asarray(from_free(name, np.asarray(free)), float)
 
 
@@ -175,7 +179,7 @@ def draw_learning(fit, errors):
 
 
 def save_figure(figure, path):
-    """Write a figure as PNG, whole or not at all."""
+    """Write a figure as PNG, atomically."""
     with matplotlib.rc_context(STYLE):
         write_figure(figure, path)
 
@@ -188,7 +192,7 @@ def _draw_parameter(axes, fit, errors, i, name):
     axes.plot(0, path[0], "o", color=RECKONING, ms=5, label="start", clip_on=False, zorder=5)
     axes.axhline(middle, color=LANDMARK, lw=1.2, label="estimate")
     axes.axhspan(low, high, color=LANDMARK, alpha=0.15, lw=0, label="± 1 standard error")
-    # What is hardly known has an error that would hide the rest.
+    # The band of a weakly determined parameter must not hide the rest.
     shown = np.array([path.min(), path.max(), middle])
     span = np.ptp(shown)
     near = [max(low, shown.min() - span), min(high, shown.max() + span)]
@@ -197,8 +201,8 @@ def _draw_parameter(axes, fit, errors, i, name):
 
 
 def fit_axis(axes, side, name, low, high):
-    """Limits of an axis for a parameter between two values; logarithmic where they are far apart
-    and the parameter is learnt as a logarithm."""
+    """Set an axis' limits for a parameter between two values; logarithmic where they are far apart
+    and the free scale is a logarithm."""
     axis = getattr(axes, f"{side}axis")
     if TABLE[name].scale == "log" and low > 0 and high / low > WIDE:
         getattr(axes, f"set_{side}scale")("log")
@@ -220,15 +224,15 @@ def _draw_likelihood(axes, fit):
 
 
 def _draw_held_out(axes, fit, errors):
-    told = fit.history
+    history = fit.history
     axes.errorbar(
-        told.held_out_step, told.held_out, told.held_out_error,
+        history.held_out_step, history.held_out, history.held_out_error,
         fmt="o-", color=REFINED, ms=4, lw=1.2, capsize=2,
     )  # fmt: skip
-    # The one that the last Newton step went from.
-    chosen = np.flatnonzero((np.asarray(told.tail) == errors.free).all(1))
+    # The evaluation from which the last Newton step started.
+    chosen = np.flatnonzero((np.asarray(history.tail) == errors.free).all(1))
     if len(chosen):
-        step, value = told.held_out_step[chosen[0]], told.held_out[chosen[0]]
+        step, value = history.held_out_step[chosen[0]], history.held_out[chosen[0]]
         axes.plot(step, value, "o", ms=10, mfc="none", mec=LANDMARK, mew=1.5)
         axes.annotate("taken", (step, value), (-9, -3), textcoords="offset points", ha="right")
     axes.ticklabel_format(axis="y", useOffset=False)

@@ -1,7 +1,7 @@
-"""One file of a run put aside: arrays by name, and a manifest by which each of them is checked.
+"""The file of a checkpoint, named arrays and a manifest, and the fingerprint of a run in it.
 
-An uncompressed `.npz`, never pickled. The manifest is its last entry, JSON as bytes: what the run
-was told, and of every array its shape, type and SHA-256.
+An uncompressed `.npz`, never pickled. The manifest is its last entry, JSON as bytes: the run's
+fingerprint, and shape, type and SHA-256 of every array.
 """
 
 import json
@@ -12,40 +12,43 @@ from hashlib import sha256
 
 import numpy as np
 
+from jaxslam.config import FORMER_FIELDS
 from jaxslam.files import atomic_write, fsync_all
 from jaxslam.logs.log_file import entries_of
+from jaxslam.parameters import current_names
 
 FORMAT = 1
 MANIFEST = "manifest"
-PIECE = 1 << 20  # bytes at once: checksum and write while they are in cache
+IRRELEVANT = ("devices",)  # settings that do not change the result
+PIECE = 1 << 20  # bytes hashed and written at a time, while they are in cache
 
 
 def write_checkpoint(path, about, columns):
-    """Write a checkpoint, all or nothing.
+    """Write a checkpoint atomically.
 
     `about`: a dict for the manifest. `columns`: pairs of a name and a list of arrays, which are
-    joined along the first axis; looked at one by one, so that only one need be on the host. Raises
-    `OSError` where there is no space, `ValueError` where the place can't be written.
+    concatenated; an iterator, so that only one need be on the host at a time. Raises `OSError` if
+    the disk is full, `ValueError` if the file can't be written.
     """
     listed = {}
     with atomic_write(path) as file, zipfile.ZipFile(file, "w") as archive:
         for name, parts in columns:
-            listed[name] = _put(archive, name, parts)
+            listed[name] = _write_entry(archive, name, parts)
         text = json.dumps(about | {"format": FORMAT, "arrays": listed})
-        _put(archive, MANIFEST, [np.frombuffer(text.encode(), np.uint8)])
+        _write_entry(archive, MANIFEST, [np.frombuffer(text.encode(), np.uint8)])
     fsync_all(path.parent)
 
 
-def _put(archive, name, parts):
-    """Write one entry, without a copy of it; gives its line of the manifest."""
+def _write_entry(archive, name, parts):
+    """Write an array without copying it, and return its record in the manifest."""
     shape, dtype = parts[0].shape, parts[0].dtype
     if len(parts) > 1:
         shape = (sum(map(len, parts)), *shape[1:])
     digest = sha256()
     entry = zipfile.ZipInfo(name + ".npy", (1980, 1, 1, 0, 0, 0))
-    head = {"descr": dtype.str, "fortran_order": False, "shape": shape}
+    header = {"descr": dtype.str, "fortran_order": False, "shape": shape}
     with archive.open(entry, "w", force_zip64=True) as member:
-        np.lib.format.write_array_header_1_0(member, head)
+        np.lib.format.write_array_header_1_0(member, header)
         for part in parts:
             data = np.ascontiguousarray(part).reshape(-1).view(np.uint8).data
             for start in range(0, len(data), PIECE):
@@ -57,61 +60,90 @@ def _put(archive, name, parts):
 
 @contextmanager
 def open_checkpoint(path):
-    """A checkpoint's manifest, and a function of a name that reads and checks that array.
+    """Open a checkpoint as its manifest and a function that reads and checks an array by name.
 
-    Both raise `ValueError` for whatever is not as it was written.
+    Names are today's, also in a checkpoint of version 0.1. Both raise `ValueError` for whatever is
+    broken.
     """
     with ExitStack() as stack:
-        with _blaming(path):
+        with _name_in_errors(path):
             archive = stack.enter_context(zipfile.ZipFile(path))
-            about = json.loads(_get(archive, MANIFEST, None).tobytes())
+            about = json.loads(_read_entry(archive, MANIFEST, None).tobytes())
             if about["format"] != FORMAT:
                 raise ValueError(f"format {about['format']}; this version reads {FORMAT}")
+            about["run"] = current_settings(about["run"])
 
         def get(name):
-            with _blaming(path):
-                return _get(archive, name, about["arrays"][name])
+            with _name_in_errors(path):
+                if name not in about["arrays"]:
+                    name = name.replace("summary.landmark_id", "summary.match")
+                    name = name.replace("landmark_id", "birth")
+                return _read_entry(archive, name, about["arrays"][name])
 
         yield about, get
 
 
+def current_settings(settings):
+    """Replace the names that version 0.1 gave to settings and parameters."""
+    config = {FORMER_FIELDS.get(name, name): value for name, value in settings["config"].items()}
+    return settings | {"config": config, "params": current_names(settings["params"])}
+
+
 @contextmanager
-def _blaming(path):
+def _name_in_errors(path):
     try:
         yield
-    except MemoryError:  # no fault of the file
+    except MemoryError:  # not the file's fault
         raise
-    except Exception as err:  # broken bytes: zipfile, JSON and NumPy raise whatever they like
+    except Exception as err:  # broken bytes: zipfile, JSON and NumPy raise errors of any type
         reason = (str(err).splitlines() or [""])[0] or type(err).__name__
         raise ValueError(f"{path.name}: {reason}") from err
 
 
-def _get(archive, name, line):
-    """The array of one entry; `line`: that of the manifest (None: for the manifest itself)."""
+def _read_entry(archive, name, record):
+    """Read an array and check it by its `record` in the manifest (None: the manifest itself)."""
     info = archive.getinfo(name + ".npy")
     with archive.open(info) as member:
         np.lib.format.read_magic(member)
         shape, _, dtype = np.lib.format.read_array_header_1_0(member)
         size = math.prod(shape) * dtype.itemsize
         if dtype.kind not in "biuf" or size != info.file_size - member.tell():
-            raise ValueError(f"entry {name} is not as it was written")
-        if line and (list(shape), dtype.str) != (line["shape"], line["dtype"]):
-            raise ValueError(f"entry {name} is not what its manifest says")
+            raise ValueError(f"entry {name} has a broken header")
+        if record and (list(shape), dtype.str) != (record["shape"], record["dtype"]):
+            raise ValueError(f"entry {name} has another shape or type than in the manifest")
         array, digest = np.empty(shape, dtype), sha256()
         data = array.reshape(-1).view(np.uint8).data
         for start in range(0, size, PIECE):
             piece = data[start : start + PIECE]
             if member.readinto(piece) != len(piece):
-                raise ValueError(f"entry {name} ends too soon")
+                raise ValueError(f"entry {name} is truncated")
             digest.update(piece)
-        member.read(1)  # the end, where zipfile compares its own checksum
-    if line and digest.hexdigest() != line["sha256"]:
-        raise ValueError(f"entry {name} has another checksum")
+        member.read(1)  # at the end, zipfile compares its checksum
+    if record and digest.hexdigest() != record["sha256"]:
+        raise ValueError(f"entry {name} has a wrong checksum")
     return array
 
 
-def digest_of_log(log):
-    """SHA-256 of everything in a log."""
+def run_fingerprint(log, config, params, seed):
+    """Collect what determines the result of a run, for JSON."""
+    return {
+        "frames": [len(log.frame_time), *map(int, log.frame_time[[0, -1]])],
+        **run_settings(config, params, seed),
+        "log": _hash_log(log),
+    }
+
+
+def run_settings(config, params, seed):
+    """Collect the part of a run's fingerprint that is not of the log."""
+    return {
+        "seed": int(seed),
+        "config": {k: v for k, v in vars(config).items() if k not in IRRELEVANT},
+        "params": {k: float(v) for k, v in params._asdict().items()},
+    }
+
+
+def _hash_log(log):
+    """Compute the SHA-256 of a log's entries."""
     digest = sha256()
     for name, array in sorted(entries_of(log).items()):
         digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())

@@ -1,8 +1,7 @@
-"""Long runs: put aside now and then, interrupted, gone on with, and refused if they do not fit.
+"""Checkpoints: write the state of a long run now and then, and resume from it.
 
-A run's folder is unfinished while it holds `checkpoints/` or a lock and no `summary.json`. Whatever
-moment a process dies at, the folder it leaves can be gone on with, or is finished. A run that goes
-on gives bit for bit what it would have given undisturbed.
+A run folder is unfinished while it holds `checkpoints/` or a lock and no `summary.json`. Whenever a
+process dies, the run in its folder is finished or can be resumed, to the same bits as undisturbed.
 """
 
 import math
@@ -22,14 +21,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.config import FORMER_FIELDS
 from jaxslam.filter import sharding
 from jaxslam.logs.odometry import Odometry
 from jaxslam.models.sensors import Measurements
-from jaxslam.parameters import current_names, default_params
+from jaxslam.parameters import default_params
 from jaxslam.results import run_folder, run_lock
-from jaxslam.runs import checkpoint_file, compiled
-from jaxslam.runs import memory as capacity
+from jaxslam.runs import checkpoint_file, compiled, memory
 from jaxslam.runs.assemble import RunProgress, Summary
 from jaxslam.runs.cluster import end_now, find_differences
 from jaxslam.smoother.genealogy import Tree
@@ -37,13 +34,13 @@ from jaxslam.smoother.rejuvenation import SharedPast
 
 KEPT = 2  # checkpoints
 UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}
-AGAIN = "; go on with the same command and --resume"
-STOP = 2  # what the processes of a run agree on after a chunk: 0 go on, 1 put aside, 2 and end
-NO_MATTER = ("devices",)  # settings that do not change the result
+AGAIN = "; to resume, repeat the command with --resume"
+STOP = 2  # what all processes do after a chunk: 0 continue, 1 write a checkpoint, 2 and stop
+SIGNALS = signal.SIGINT, signal.SIGTERM
 
 
 def parse_interval(text):
-    """Seconds of `60`, `60s`, `5m` or `1h`."""
+    """Parse text like `60`, `60s`, `5m` or `1h` as seconds; raise `ValueError` for other text."""
     found = re.fullmatch(r"(\d+\.?\d*|\.\d+)([smh]?)", text.strip())
     if not found or not float(found[1]):
         raise ValueError(f"--checkpoint-every is {text!r}; must be a time above 0: 60s, 5m, 1h")
@@ -51,11 +48,11 @@ def parse_interval(text):
 
 
 def memory_of_run(config, steps=1000):
-    """`capacity.Memory` that a run of so many steps needs: compiled for it, nothing large made."""
-    size, k, looks = compiled.chunk_size(config), config.measurements, {}
+    """Return the `Memory` that a run of so many steps needs: compile it, but allocate no state."""
+    size, k, appearance = compiled.chunk_size(config), config.measurements, {}
     if config.descriptors:
-        looks["descriptor"] = jnp.zeros((size, k, config.descriptors))
-        looks["within"] = jnp.zeros((size, config.descriptors))
+        appearance["descriptor"] = jnp.zeros((size, k, config.descriptors))
+        appearance["within"] = jnp.zeros((size, config.descriptors))
     zero = jnp.zeros(size)
     chunk = (
         Odometry(*[zero] * len(Odometry._fields)),
@@ -65,37 +62,35 @@ def memory_of_run(config, steps=1000):
             identity=jnp.zeros((size, k), jnp.int32),
             valid=jnp.zeros((size, k), bool),
             active=jnp.zeros(size, bool),
-            **looks,
+            **appearance,
         ),
     )
     params = jax.tree.map(jnp.asarray, default_params(config.sensor))
-    steps_compiled = compiled.compile_loop(config, chunk, params)
-    return capacity.memory_of_compiled(
-        steps_compiled, compiled.estimate_memory(config, steps), config
-    )
+    filter_chunk = compiled.compile_loop(config, chunk, params)
+    return memory.memory_of_compiled(filter_chunk, compiled.estimate_memory(config, steps), config)
 
 
 class Checkpoints:
-    """The folder of a long run, locked while this is entered (`with`).
+    """Checkpoints in a run folder, which is locked within `with`.
 
-    `every`: seconds between checkpoints. `resume`: go on with what is there. `overwrite`: replace
-    it. `say`: gets lines worth knowing. `finished`: nothing is left to do. Entering raises
-    `BlockingIOError` naming the process that is writing there, `ValueError` for a folder that is
-    not to be written to.
+    `every`: seconds between checkpoints. `resume`: continue from the newest one. `overwrite`:
+    replace what is in the folder. `report`: called with each note, warning and line of progress.
+    `finished`: the run is complete. Entering raises `BlockingIOError` naming another process that
+    writes there, and `ValueError` for a folder that must not be written to.
     """
 
-    def __init__(self, folder, every=60.0, resume=False, overwrite=False, say=None):
+    def __init__(self, folder, every=60.0, resume=False, overwrite=False, report=None):
         self.folder, self.every, self.resume = Path(folder), every, resume
-        self.overwrite, self.say = overwrite, say or _print_to_stderr
+        self.overwrite, self.report = overwrite, report or _print_to_stderr
         self.finished, self.stopped, self._kept, self._lock = False, False, [], None
 
     def __enter__(self):
         run_folder.check_target(self.folder, self.overwrite, self.resume)
-        self._above = [place for place in self.folder.parents if not place.exists()]
+        self._made = [parent for parent in self.folder.parents if not parent.exists()]
         self.folder.mkdir(parents=True, exist_ok=True)
         self._lock = run_lock.acquire(self.folder)
         names = {path.name for path in self.folder.iterdir()} - {run_lock.NAME}
-        if names and not (self.resume or self.overwrite):  # another run came in between
+        if names and not (self.resume or self.overwrite):  # another run has just begun here
             os.close(self._lock)
             raise ValueError(f"{self.folder}: exists; choose another folder or add --overwrite")
         self.finished = self.resume and run_folder.FINISHED in names
@@ -104,71 +99,69 @@ class Checkpoints:
         return self
 
     def __exit__(self, kind, error, _):
-        if not self._files():  # nothing to go on with: the folder as it was before
+        if not self._files():  # nothing to resume from: leave the folder as it was before
             self.clear()
-        # While the lock is still held; whoever waits for it makes a file of its own.
+        # While the lock is still held; a process that waits for it creates another file.
         (self.folder / run_lock.NAME).unlink(missing_ok=True)
         with suppress(OSError):  # not empty
-            for place in (self.folder, *self._above):
-                place.rmdir()
+            for folder in (self.folder, *self._made):
+                folder.rmdir()
         os.close(self._lock)
         if kind is KeyboardInterrupt and not error.args and self._files():
             raise KeyboardInterrupt(AGAIN) from None
 
     def check_fingerprint(self, log, config, params, seed):
-        """Raise `ValueError` if what there is to go on with is of another run."""
-        self._run = {
-            **run_fingerprint(log, config, params, seed),
-            "precision": jnp.zeros(()).dtype.name,
-        }
+        """Raise `ValueError` if the checkpoints are those of a run with another fingerprint."""
+        self._run = checkpoint_file.run_fingerprint(log, config, params, seed)
+        self._run["precision"] = jnp.zeros(()).dtype.name
         self._readable = []
         for path in self._files() if self.resume else ():
             try:
                 with checkpoint_file.open_checkpoint(path) as (about, _):
-                    before, versions = _current(about["run"]), about["versions"]
+                    before, versions = about["run"], about["versions"]
             except ValueError as error:
-                self.say(f"warning: a broken checkpoint is left aside: {error}")
+                self.report(f"warning: skipping a broken checkpoint: {error}")
                 continue
             if differing := find_differences(before, self._run):
-                raise ValueError(f"{self.folder}: is of another run; differing: {differing}")
+                raise ValueError(
+                    f"{self.folder}: the checkpoint is of another run; differing: {differing}"
+                )
             if not self._readable and versions != run_folder.versions():
-                self.say("note: other versions wrote this checkpoint: last digits may differ")
+                self.report("note: other versions wrote this checkpoint; last digits may differ")
             self._readable.append(path)
 
     def restore(self, shapes):
-        """`Filtered` of the newest checkpoint that is sound; None: from the beginning.
-
-        `shapes`: of `filter.State`.
-        """
+        """Read the `RunProgress` of the newest intact checkpoint, or return None if there is none;
+        `shapes`: `state_shapes` of the run."""
         for path in self._readable:
             try:
-                found = _read(path, shapes)
+                so_far = _read(path, shapes)
             except ValueError as error:
-                self.say(f"warning: a broken checkpoint is left aside: {error}")
+                self.report(f"warning: skipping a broken checkpoint: {error}")
                 continue
             self._kept = [path]
-            self.say(f"note: goes on after step {found.done}, from {path.name}")
-            sharding.broadcast_int(found.done)
-            return found
+            self.report(f"note: resuming after step {so_far.done}, from {path.name}")
+            sharding.broadcast_int(so_far.done)
+            return so_far
         if self.resume:
-            self.say(f"note: {self.folder} has nothing to go on with; starts from the beginning")
+            self.report(f"note: no checkpoint in {self.folder}; starting from the beginning")
         sharding.broadcast_int(0)
         return None
 
     def take_over_folder(self):
-        """From here on the folder is this run's: what others left in it is removed."""
+        """Remove what other runs left in the folder; from here on it is this run's."""
         run_folder.clear_results(self.folder)
         if not self.resume:
-            shutil.rmtree(self._place, ignore_errors=True)
-        self._place.mkdir(exist_ok=True)
+            shutil.rmtree(self._checkpoints, ignore_errors=True)
+        self._checkpoints.mkdir(exist_ok=True)
         self._prune()
         self._last = time.monotonic()
 
     @contextmanager
     def catch_signals(self):
-        """Within this, the first Ctrl-C (or SIGTERM) only asks to stop; the second ends at once.
+        """Catch Ctrl-C and SIGTERM: the first asks to stop after the chunk, the second exits.
 
-        By a thread, since Python itself sees no signal while the compiled code runs.
+        By a thread, as Python handles no signals while compiled code runs.
         """
         if threading.current_thread() is not threading.main_thread():
             yield
@@ -177,15 +170,14 @@ class Checkpoints:
         os.set_blocking(ends[1], False)
         watch = threading.Thread(target=self._watch, args=(ends[0],), daemon=True)
         watch.start()
-        signals = signal.SIGINT, signal.SIGTERM
-        before = [signal.signal(which, lambda *_: None) for which in signals]
-        wakeup = signal.set_wakeup_fd(ends[1], warn_on_full_buffer=False)
         try:
-            yield
+            with _handle_signals(lambda *_: None):
+                wakeup = signal.set_wakeup_fd(ends[1], warn_on_full_buffer=False)
+                try:
+                    yield
+                finally:
+                    signal.set_wakeup_fd(wakeup)
         finally:
-            signal.set_wakeup_fd(wakeup)
-            for which, handler in zip(signals, before, strict=True):
-                signal.signal(which, handler)
             os.close(ends[1])
             watch.join()
             os.close(ends[0])
@@ -193,106 +185,110 @@ class Checkpoints:
             raise KeyboardInterrupt(AGAIN)
 
     def _watch(self, end):
-        """Read signals until the other end is closed."""
-        while signs := os.read(end, 1):
-            if signs[0] not in (signal.SIGINT, signal.SIGTERM):
+        """Read signal numbers until the other end is closed."""
+        while byte := os.read(end, 1):
+            if byte[0] not in SIGNALS:
                 continue
             if self.stopped:
                 end_now("interrupted", 130)
             self.stopped = True
 
-    def save_if_due(self, at, total, line):
-        """Called after every chunk with `Filtered`: a checkpoint if it is time for one.
+    def save_if_due(self, so_far, total, line):
+        """Write a checkpoint of the `RunProgress` if it is time, and report its progress `line`.
 
-        `line`: how it goes. Raises `KeyboardInterrupt` if it was asked to stop.
+        Called after every chunk. Raises `KeyboardInterrupt` if a signal asked to stop.
         """
-        due = time.monotonic() - self._last >= self.every or at.done == total
-        wanted = sharding.broadcast_int(STOP if self.stopped else int(due))
-        if not wanted:
+        due = time.monotonic() - self._last >= self.every or so_far.done == total
+        action = sharding.broadcast_int(STOP if self.stopped else int(due))
+        if not action:
             return
-        path = _path(self._place, at.done)
-        about = {"run": self._run, "versions": run_folder.versions(), "done": at.done}
-        about |= {"seconds": at.seconds, "genealogy": at.tree is not None}
-        about |= {"past": at.shared_past is not None}
-        checkpoint_file.write_checkpoint(path, about, _columns(at))
+        path = _path(self._checkpoints, so_far.done)
+        about = dict(run=self._run, versions=run_folder.versions(), done=so_far.done)
+        about |= dict(seconds=so_far.seconds, genealogy=so_far.tree is not None)
+        about |= dict(past=so_far.shared_past is not None)
+        checkpoint_file.write_checkpoint(path, about, _columns(so_far))
         self._kept.append(path)
         self._prune()
         self._last = time.monotonic()
         if not sys.stderr.isatty():
-            self.say(f"step {at.done} of {total}, {line}")
-        if wanted == STOP:
-            raise KeyboardInterrupt(f" after step {at.done} of {total}{AGAIN}")
+            self.report(f"step {so_far.done} of {total}, {line}")
+        if action == STOP:
+            raise KeyboardInterrupt(f" after step {so_far.done} of {total}{AGAIN}")
 
     def clear(self):
-        """Remove what only an unfinished run needs; the lock goes when this is left."""
+        """Remove what only an unfinished run needs; the lock is removed on leaving `with`."""
         shutil.rmtree(self.folder / run_folder.PARTIAL, ignore_errors=True)
-        shutil.rmtree(self._place, ignore_errors=True)
+        shutil.rmtree(self._checkpoints, ignore_errors=True)
 
     @property
-    def _place(self):
+    def _checkpoints(self):
         return self.folder / run_folder.CHECKPOINTS
 
     def _files(self):
-        """Checkpoints that are there, the newest first."""
-        return sorted(self._place.glob("step-*.npz"), reverse=True)
+        """List the checkpoint files, the newest first."""
+        return sorted(self._checkpoints.glob("step-*.npz"), reverse=True)
 
     def _prune(self):
-        """Keep the last good ones, and nothing else; until there is one, whatever is there."""
+        """Remove all but the last checkpoints; nothing until this run has read or written one."""
         self._kept = list(dict.fromkeys(self._kept))[-KEPT:]
-        for path in self._place.iterdir() if self._kept else ():
+        for path in self._checkpoints.iterdir() if self._kept else ():
             if path not in self._kept:
                 path.unlink()
 
 
 class FollowerCheckpoints:
-    """What `Checkpoints` are to the other processes of a run: process 0 decides and writes.
+    """`Checkpoints` for the processes other than the leader, which decides and writes.
 
-    `wait`: called when the run is stopped, and does not return.
+    `wait_for_leader`: called when the run is stopped; does not return.
     """
 
-    def __init__(self, folder, wait):
-        self._place, self._wait = Path(folder) / run_folder.CHECKPOINTS, wait
+    def __init__(self, folder, wait_for_leader):
+        self._checkpoints = Path(folder) / run_folder.CHECKPOINTS
+        self._wait_for_leader = wait_for_leader
 
     def check_fingerprint(self, *_):
-        """Process 0 has looked."""
+        """Do nothing: the leader checks."""
 
     def restore(self, shapes):
-        """`Filtered` of the checkpoint that process 0 goes on from, or None."""
+        """Read the `RunProgress` of the checkpoint that the leader resumes from, or None."""
         done = sharding.broadcast_int(0)
         if not done:
             return None
-        path = _path(self._place, done)
+        path = _path(self._checkpoints, done)
         try:
             return _read(path, shapes)
         except ValueError as error:
-            raise ValueError(f"{path}: every process of a run has to read it: {error}") from None
+            raise ValueError(f"{path}: every process must be able to read it: {error}") from None
 
     def take_over_folder(self):
-        """Process 0 has it."""
+        """Do nothing: the leader does it."""
 
-    @contextmanager
     def catch_signals(self):
-        """Within this, signals are left to process 0, which gets them, too."""
-        signals = signal.SIGINT, signal.SIGTERM
-        before = [signal.signal(which, signal.SIG_IGN) for which in signals]
-        try:
-            yield
-        finally:
-            for which, handler in zip(signals, before, strict=True):
-                signal.signal(which, handler)
+        """Ignore signals: the leader gets them, too."""
+        return _handle_signals(signal.SIG_IGN)
 
-    def save_if_due(self, at, total, line):
-        """Give process 0 what it puts aside."""
-        wanted = sharding.broadcast_int(0)
-        if wanted:
-            for _ in _state_columns(at.state):
+    def save_if_due(self, so_far, total, line):
+        """Take part in gathering the state if the leader writes a checkpoint."""
+        action = sharding.broadcast_int(0)
+        if action:
+            for _ in _state_columns(so_far.state):
                 pass
-        if wanted == STOP:
-            self._wait()
+        if action == STOP:
+            self._wait_for_leader()
+
+
+@contextmanager
+def _handle_signals(handler):
+    before = [signal.signal(number, handler) for number in SIGNALS]
+    try:
+        yield
+    finally:
+        for number, former in zip(SIGNALS, before, strict=True):
+            signal.signal(number, former)
 
 
 def check_finished(folder, log, config, params, seed):
-    """Raise `ValueError` if the run that is finished there was told otherwise."""
+    """Raise `ValueError` if the finished run in a folder is broken, or had other settings."""
     try:
         with open(folder / "steps.npz", "rb") as file, np.load(file) as steps:
             same = np.array_equal(steps["time"], log.frame_time)
@@ -301,109 +297,74 @@ def check_finished(folder, log, config, params, seed):
     if not same:
         raise ValueError(f"{folder}: is finished, but of another log, or part of it")
     before = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8"))
-    if differing := find_differences(_current(before), _settings(config, params, seed)):
+    before = checkpoint_file.current_settings(before)
+    if differing := find_differences(before, checkpoint_file.run_settings(config, params, seed)):
         raise ValueError(f"{folder}: is finished, but of another run; differing: {differing}")
 
 
-def run_fingerprint(log, config, params, seed):
-    """What a run was told that decides its result, for JSON."""
-    return {
-        "frames": [len(log.frame_time), *map(int, log.frame_time[[0, -1]])],
-        **_settings(config, params, seed),
-        "log": checkpoint_file.digest_of_log(log),
-    }
+def _path(folder, done):
+    return folder / f"step-{done:08}.npz"
 
 
-def _settings(config, params, seed):
-    """`told` but for the log."""
-    return {
-        "seed": int(seed),
-        "config": {k: v for k, v in vars(config).items() if k not in NO_MATTER},
-        "params": {k: float(v) for k, v in params._asdict().items()},
-    }
-
-
-def _current(told):
-    """Settings as a file holds them, with names of version 0.1 replaced."""
-    config = {FORMER_FIELDS.get(name, name): value for name, value in told["config"].items()}
-    return told | {"config": config, "params": current_names(told["params"])}
-
-
-def _current_entries(get, stored):
-    """`get`, a function of an entry's name, that also finds entries by their names of version 0.1;
-    `stored`: the names that are there."""
-
-    def get_by_either(name):
-        former = name.replace("summary.landmark_id", "summary.match")
-        former = former.replace("landmark_id", "birth").replace(".appearances", ".looks")
-        return get(name if name in stored else former)
-
-    return get_by_either
-
-
-def _path(place, done):
-    return place / f"step-{done:08}.npz"
-
-
-def _names(state):
-    """Pairs of a name and a leaf."""
+def _named_leaves(state):
+    """List pairs of a name and a leaf."""
     pairs, _ = jax.tree_util.tree_flatten_with_path(state)
     return [("state" + jax.tree_util.keystr(path), leaf) for path, leaf in pairs]
 
 
 def _state_columns(state):
-    """Names and arrays, of which only one at a time is fetched."""
-    for name, leaf in _names(state):
+    """Yield names and arrays; only one at a time is copied to the host."""
+    for name, leaf in _named_leaves(state):
         yield name, [sharding.to_host(leaf)]
 
 
-def _columns(at):
-    """What a checkpoint holds."""
-    yield from _state_columns(at.state)
-    yield "entropy", at.entropy
-    for name in at.summaries[0]._fields:
-        yield f"summary.{name}", [getattr(part, name) for part in at.summaries]
-    if at.shared_past is not None:
-        for name, column in at.shared_past._asdict().items():
+def _columns(so_far):
+    """Yield names and lists of arrays of everything in a checkpoint."""
+    yield from _state_columns(so_far.state)
+    yield "entropy", so_far.entropy
+    for name in Summary._fields:
+        yield f"summary.{name}", [getattr(part, name) for part in so_far.summaries]
+    if so_far.shared_past is not None:
+        for name, column in so_far.shared_past._asdict().items():
             yield f"past.{name}", [column]
-    if at.tree is not None:
-        yield "tree.nodes", [np.array([len(level) for level in at.tree.pose])]
+    if so_far.tree is not None:
+        yield "tree.nodes", [np.array([len(level) for level in so_far.tree.pose])]
         for name in ("pose", "landmark_id", "origin"):
-            yield f"tree.{name}", getattr(at.tree, name)
+            yield f"tree.{name}", getattr(so_far.tree, name)
 
 
 def _read(path, shapes):
-    """`Filtered` of a checkpoint. Raises `ValueError` if anything in it is not sound."""
+    """Read the `RunProgress` of a checkpoint; raise `ValueError` if anything in it is broken."""
     with checkpoint_file.open_checkpoint(path) as (about, get):
-        get = _current_entries(get, about["arrays"])
         summary = Summary(*(get(f"summary.{name}") for name in Summary._fields))
-        tree = _tree(get) if about["genealogy"] and sharding.is_leader() else None
-        past = (
-            SharedPast(*(get(f"past.{name}") for name in SharedPast._fields))
-            if about["past"]
-            else None
-        )
-        named, leaves = _names(shapes), {}
-        # The largest first: while an array is copied to the device, it is there twice.
-        for name, shape in sorted(named, key=lambda pair: -math.prod(pair[1].shape)):
-            array = get(name)
-            if (array.shape, array.dtype) != (shape.shape, shape.dtype):
-                raise ValueError(f"{path.name}: {name} has another shape or type")
-            # A copy: memory of NumPy's can't be given up.
-            leaves[name] = sharding.to_devices(array, shape)
-        state = jax.tree.unflatten(jax.tree.structure(shapes), [leaves[name] for name, _ in named])
-        return RunProgress(
-            state, [summary], tree, about["done"], about["seconds"], past, [get("entropy")]
-        )
+        tree = _read_tree(get) if about["genealogy"] and sharding.is_leader() else None
+        past = None
+        if about["past"]:
+            past = SharedPast(*(get(f"past.{name}") for name in SharedPast._fields))
+        state = _read_state(path, get, shapes)
+        entropy = [get("entropy")]
+    return RunProgress(state, [summary], tree, about["done"], about["seconds"], past, entropy)
 
 
-def _tree(get):
-    """The genealogy, level by level; copies, since the levels die one by one."""
+def _read_state(path, get, shapes):
+    named, leaves = _named_leaves(shapes), {}
+    # The largest first: while an array is copied to the device, there are two of it.
+    for name, shape in sorted(named, key=lambda pair: -math.prod(pair[1].shape)):
+        array = get(name)
+        if (array.shape, array.dtype) != (shape.shape, shape.dtype):
+            raise ValueError(f"{path.name}: {name} has another shape or type")
+        # A copy: JAX can't donate memory of NumPy.
+        leaves[name] = sharding.to_devices(array, shape)
+    return jax.tree.unflatten(jax.tree.structure(shapes), [leaves[name] for name, _ in named])
+
+
+def _read_tree(get):
+    """Read the genealogy level by level; copies, since levels are freed one by one."""
     tree, nodes = Tree(), get("tree.nodes")
     ends = np.cumsum(nodes)
     for name in ("pose", "landmark_id"):
         setattr(tree, name, [part.copy() for part in np.split(get(f"tree.{name}"), ends[:-1])])
-    # The nodes of a level point to the level before; the last ones' children are the particles.
+    # A level's nodes are counted by the next level's origins; the last level's by the particles.
     ends = np.cumsum(nodes[1:])
     tree.origin = [part.copy() for part in np.split(get("tree.origin"), ends)]
     return tree

@@ -58,9 +58,7 @@ def fit_segments(edges, columns_per_pixel):
     size = np.bincount(segment, np.abs(along), n)
     first, last = _ends(edges, np.abs(along) >= FADED * mean(np.abs(along), segment, n)[segment], n)
     start, block = np.unique(
-        segment * len(edges.along) + edges.row // BLOCK,
-        return_index=True,
-        return_inverse=True,
+        segment * len(edges.along) + edges.row // BLOCK, return_index=True, return_inverse=True
     )[1:]
     profile = np.stack([np.bincount(block, part) for part in across.T], -1)
     peak, scatter, width = _peak(profile, segment[start], n)

@@ -27,11 +27,6 @@ class Edges(NamedTuple):
     gradient: np.ndarray
     along: np.ndarray
 
-    def take(self, index):
-        """The peaks selected by an index or mask; segments keep their numbers."""
-        part = (column[index] for column in (self.segment, self.row, self.column))
-        return Edges(*part, self.gradient, self.along)
-
 
 def find_edges(panorama_image, valid, contrast, significance, length, gap, slope):
     """Find the `Edges` of a panorama uint8 [H, W, C] where the mask `valid` [H, W] is set.

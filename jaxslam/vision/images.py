@@ -78,11 +78,6 @@ def read_image(path):
     return image
 
 
-def image_header(path):
-    """Read the `Header` of an image file, without decoding it. Raises `ValueError`."""
-    return _parse_header(path, _read_bytes(path))[1]
-
-
 def _parse_header(path, data):
     """Pillow's image, not decoded, and the `Header`, from the bytes of a file."""
     parse = next((parse for start, parse in PARSERS.items() if data.startswith(start)), None)

@@ -21,7 +21,6 @@ from jaxslam.vision.panorama import panorama, unwrap
 
 BESIDE = (2, 3, 4)  # columns from an edge over which the colour beside it is averaged
 STEP = np.sqrt(2 * pi)  # contrast of an edge over (its width x its largest gradient)
-LEAST_HALF = 6  # rows of half a line
 WIDEST = 1.5  # columns, width of the softest edge to detect
 SOFTER, RAMP = 1.1, 0.5  # an edge wider than most by SOFTER may be off by RAMP of its width
 
@@ -99,29 +98,6 @@ def extract_lines(image: np.ndarray, camera: Camera, settings: LineSettings | No
     if settings.merge:
         lines = merge_pieces(lines, settings.merge_bearing, settings.merge_gap)
     return lines.take(np.argsort(lines.bearing, kind="stable"))
-
-
-def halves(image, camera, settings=None):
-    """Bearings [n] rad of the upper and of the lower halves of lines at least twice `length` long.
-
-    They differ if the camera's tilt or calibration is wrong.
-    """
-    settings = settings or LineSettings()
-    view, picture = _panorama(image, camera, settings)
-    edges, level = _edges(picture, view, settings)
-    wide = _columns_per_pixel(view)
-    fit = fit_segments(edges, wide)
-    keep = _upright(fit, view, settings, level)
-    keep &= (fit.last - fit.first) * view.row_height >= 2 * settings.length
-    lower = edges.row > ((fit.first + fit.last) / 2)[edges.segment]
-    count = [np.bincount(edges.segment, part, len(keep)) for part in (~lower, lower)]
-    keep &= np.minimum(*count) >= LEAST_HALF
-    part = edges.take(keep[edges.segment])
-    segment = 2 * part.segment + lower[keep[edges.segment]]
-    column = fit_segments(part._replace(segment=np.unique(segment, return_inverse=True)[1]), wide)
-    upper, lower = view.bearing(column.column.reshape(-1, 2) - PAD).T
-    both = np.isfinite(upper) & np.isfinite(lower)
-    return upper[both], lower[both]
 
 
 def _panorama(image, camera, settings):

@@ -3,13 +3,13 @@
 import jax
 import numpy as np
 import pytest
+from simulated_boards import azimuth_error, simulate_boards
 
 from calibration.bundle import Corners, derivatives, rotation
 from calibration.camera import calibrate_camera, calibrate_corners, cross_validate
 from calibration.camera_report import draw, text
-from calibration.coverage import angle_change, azimuth_error
+from calibration.coverage import angle_change
 from calibration.initial import first_solution
-from calibration.simulated import simulate_boards
 from jaxslam.simulation.room.render import double_mirror_camera
 from jaxslam.vision.camera import Camera, ray_to_pixel
 from jaxslam.vision.camera_files import load_camera, save_camera

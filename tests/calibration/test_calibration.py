@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calibration.odometry import motion_residuals
-from calibration.sensor import fit, turn_frame
+from calibration.sensor import fit
 from jaxslam.logs.log import Truth
 from jaxslam.logs.log_file import load_log
 from jaxslam.models import motion
@@ -120,6 +120,16 @@ def test_bearings_alone_are_enough():
     for name in ("sigma_bearing", "landmark_extent", "mount_yaw", "err_drift"):
         near = 0.3 * found.standard_errors[name]  # outliers in range are no longer left out
         assert found.values[name] == pytest.approx(model().values[name], abs=near), name
+
+
+def turn_frame(log, yaw):
+    """Turn the robot's frame in a log by `yaw` [rad]: by `drive_yaw`, it then drives along x."""
+    (x, y, heading), c, s = log.mounting, np.cos(yaw), np.sin(yaw)
+    turn, truth = np.array([0, 0, yaw]), log.truth
+    if truth is not None and truth.pose is not None:
+        truth = replace(truth, pose=truth.pose + turn)
+    mounting = c * x + s * y, c * y - s * x, heading - yaw
+    return replace(log, mounting=mounting, start_pose=log.start_pose + turn, truth=truth)
 
 
 def test_turning_the_robots_frame_changes_only_where_it_drives():

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from line_halves import halves
 from stripes import mirror_camera, painted, photograph, room_of_stripes, stripes
 
 from calibration.tilt import Tilt, camera_with_tilt, camera_with_up, describe, find_tilt
 from jaxslam.vision.camera import tilt_matrix
 from jaxslam.vision.camera_files import load_camera
 from jaxslam.vision.images import Images
-from jaxslam.vision.lines import halves
 
 
 def degrees(found):

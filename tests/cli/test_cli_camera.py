@@ -7,11 +7,11 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from simulated_boards import simulate_boards
 
 from calibration import camera as fitting
 from calibration.bundle import rotation
 from calibration.corners import VARIANTS, Views, board_points
-from calibration.simulated import simulate_boards
 from jaxslam.vision.camera import Camera
 from jaxslam.vision.camera_files import load_camera
 

@@ -128,9 +128,9 @@ def test_stopped_and_resumed_gives_the_same(logs, at, call, refuse, monkeypatch)
     code, out, err = call(*told, "two/params.toml")
     assert code == 130
     assert out == ""
-    assert "--resume goes on from here" in err
+    assert "--resume continues from here" in err
     assert [path.name for path in (at / "two").iterdir()] == [cli_learn.CHECKPOINT]
-    assert "a fit was stopped here; --resume goes on" in refuse(*told, "two/params.toml")
+    assert "a fit was stopped here; --resume continues it" in refuse(*told, "two/params.toml")
     monkeypatch.undo()
     monkeypatch.chdir(at)
     code, again, _ = call(*told, "two/params.toml", "--resume")
@@ -176,7 +176,7 @@ def test_what_is_lost_or_worse_is_a_warning(logs, call, drives, monkeypatch):
     code, _, err = call(*known, "--held-out", "b.npz", "--overwrite", "--start", "1")
     assert code == 1
     assert "warning: held-out evidence is not finite" in err
-    assert "note: the held-out logs got less likely" in err
+    assert "note: the held-out logs became less likely" in err
 
 
 def test_windows_without_identities_are_left_out(logs, drives, capsys):
@@ -188,7 +188,7 @@ def test_windows_without_identities_are_left_out(logs, drives, capsys):
     assert len(cli_learn._windows(["a.npz"], 0.0, None, 1.0, 0.0, False)) == 4
 
 
-def test_caution_becomes_a_part_of_what_is_learnt():
+def test_caution_becomes_a_part_of_what_is_learned():
     params = default_params("bearing")
     given = Config(sensor="bearing")
     log = planar.planar(length_m=1.0, landmarks=3)
@@ -207,25 +207,31 @@ def test_caution_becomes_a_part_of_what_is_learnt():
 @pytest.mark.parametrize(
     ("told", "found"),
     [
-        ((), "learn: which log?"),
+        ((), "learn: no log given; for example lost-in-the-woods"),
         (("none.npz",), "none.npz: no such file"),
         (
             ("a.npz", "--parameters", "err_rt"),
-            "'err_rt' can't be learnt with sensor range_bearing; these can: err_tran",
+            "'err_rt' can't be learned with sensor range_bearing; these can: err_tran",
         ),
-        (("a.npz", "--parameters", "detection"), "'detection' can't be learnt"),
+        (("a.npz", "--parameters", "detection"), "'detection' can't be learned"),
         (("a.npz", "--parameters", "err_rot,err_rot"), "name each once"),
-        (("a.npz", "--held-out", "a.npz"), "a.npz: learnt from and held out; part it"),
-        (("a.npz", "--end", "2", "--held-out", "a.npz", "--held-out-start", "1"), "held out; part"),
+        (
+            ("a.npz", "--held-out", "a.npz"),
+            "a.npz: both learned from and held out; separate the parts",
+        ),
+        (
+            ("a.npz", "--end", "2", "--held-out", "a.npz", "--held-out-start", "1"),
+            "held out; separate",
+        ),
         (("a.npz", "--end", "99", "--start", "98"), "no frame between 98 and 99 s"),
         (("a.npz", "--window", "-1"), "windows of -1.0 s; must be above 0"),
         (("a.npz", "--out", "fit.csv"), "fit.csv: a file of parameters is a .toml file"),
         (("a.npz", "--out", "new/fit.csv"), "fit.csv: a file of parameters is a .toml file"),
-        (("a.npz", "--resume"), "learn.checkpoint.npz: is not there; begin without --resume"),
-        (("a.npz", "--parameters", "err_rot,outlier"), "outlier is 0: to be learnt it must start"),
+        (("a.npz", "--resume"), "learn.checkpoint.npz: does not exist; start without --resume"),
+        (("a.npz", "--parameters", "err_rot,outlier"), "outlier is 0: to be learned it must start"),
         (
             ("a.npz", "--sensor", "position", "--parameters", "landmark_extent"),
-            "'landmark_extent' can't be learnt",
+            "'landmark_extent' can't be learned",
         ),
         (("a.npz", "--params", "none.toml"), "none.toml: no such file"),
         (("a.npz", "--seeds", "1"), "--seeds"),

@@ -17,7 +17,7 @@ from jaxslam.cli import main as cli
 from jaxslam.config import Config
 from jaxslam.logs.log_file import save_log
 from jaxslam.parameters import default_params
-from jaxslam.runs import checkpoints, cluster
+from jaxslam.runs import checkpoint_file, cluster
 from jaxslam.runs.cluster import ClusterAddress
 from jaxslam.simulation.planar import planar
 
@@ -165,9 +165,9 @@ def test_a_run_of_two_that_was_killed_goes_on_alone_or_with_another(there):
     for path in (there / "again" / "checkpoints").iterdir():
         (copy / path.name).write_bytes(path.read_bytes())
     code, _, err = run(there, *long, "--resume", "--devices", 4)
-    assert code < 2 and "note: goes on after step " in err, err
+    assert code < 2 and "note: resuming after step " in err, err
     lead, other = together(there, *SMALL, "--out", "again", "--resume")
-    assert lead[0] == other[0] < 2 and "note: goes on after step " in lead[2], (lead, other)
+    assert lead[0] == other[0] < 2 and "note: resuming after step " in lead[2], (lead, other)
     for name in ("long", "again"):
         assert results(there / name) == results(there / "one")
         assert not (there / name / "checkpoints").exists()
@@ -308,7 +308,8 @@ def test_options_go_before_the_launcher():
 
 
 def test_a_run_is_the_same_whoever_shares_it():
-    one, two = (checkpoints._settings(Config(devices=d), default_params(), 0) for d in (1, 2))
+    settings = checkpoint_file.run_settings
+    one, two = (settings(Config(devices=d), default_params(), 0) for d in (1, 2))
     assert one == two
 
 

@@ -53,7 +53,7 @@ def test_the_free_scale_there_and_back(x64, name):
 
 def test_what_starts_at_zero_has_no_logarithm(start):
     with pytest.raises(
-        ValueError, match="landmark_extent is 0: to be learnt it must start above 0"
+        ValueError, match="landmark_extent is 0: to be learned it must start above 0"
     ):
         transforms.free_vector(start, ("landmark_extent",))
 
@@ -115,21 +115,21 @@ def test_bounds_hold_and_priors_pull(logs, start):
         (
             ("extra_bearing_noise",),
             {},
-            "'extra_bearing_noise' can't be learnt with sensor range_bearing; these can: err",
+            "'extra_bearing_noise' can't be learned with sensor range_bearing; these can: err",
         ),
         (("sigma_range",), {"bounds": {"sigma_range": (1.0, 2.0)}}, "outside its bounds 1 to 2"),
         (("sigma_range",), {"priors": {"err_rot": (1.0, 2.0)}}, "err_rot has bounds or a prior"),
         (("sigma_range",), {"seeds": 0}, "seeds is 0; must be 1 or more"),
     ],
 )
-def test_what_can_not_be_learnt_is_refused(logs, start, names, told, found):
+def test_what_can_not_be_learned_is_refused(logs, start, names, told, found):
     with pytest.raises(ValueError, match=found):
         fit.fit(logs, CONFIG, start, names, **told)
     with pytest.raises(ValueError, match="no log"):
         fit.fit([], CONFIG, start, ("sigma_range",))
 
 
-def test_the_best_match_is_learnt_with_a_warning(logs, start):
+def test_the_best_match_is_learned_with_a_warning(logs, start):
     biased = dataclasses.replace(CONFIG, association="maximum_likelihood", forgetting=None)
     with pytest.warns(UserWarning, match="biases the score"), pytest.raises(ValueError):
         fit.fit([], biased, start, ("sigma_range",))
@@ -152,7 +152,7 @@ def test_two_devices_give_what_one_gives(pytestconfig):
     np.testing.assert_allclose(two, one, rtol=2e-3)
 
 
-@pytest.mark.parametrize("uniform_association_prior", [False, True])
+@pytest.mark.parametrize("even", [False, True])
 def test_a_landmark_held_twice_gains_nothing_where_association_is_even(x64, even):
     config = Config(
         sensor="position", association="sampled", uniform_association_prior=even, clutter=False,

@@ -48,10 +48,10 @@ def make_errors(free_error=(0.1, 0.2, 9.0), **changes):
         free_error=free_error,
         standard_error=free_error * slope,
         monte_carlo_error=0.25 * free_error * slope,
-        outer=np.diag(1 / free_error**2),
+        opg=np.diag(1 / free_error**2),
         curvature=np.diag(1 / free_error**2),
         agreement=np.ones(3),
-        made="both",
+        covariance_method="both",
         step=np.zeros(3),
         log_z_sd=0.5,
         discounts={0.9: np.array([0.0, 10.0, 0.0]), 0.97: np.zeros(3), 1.0: np.zeros(3)},
@@ -83,7 +83,7 @@ def test_the_sentences():
     text = "\n".join(learn_report.describe(make_fit(), make_errors(), judged))
     assert "all steps done (20 steps, 12 s)" in text
     assert "-11.00 ± 1.41 before, -5.00 ± 0.00 after, difference +6.00 ± 1.41 nats (2 fresh" in text
-    assert "standard errors: products of the scores and their slope agree" in text
+    assert "standard errors: outer products and slope of the score agree" in text
     assert "Monte-Carlo error: at most 0.25 of a standard error" in text
     assert "log Z of one log spreads by 0.50 nats" in text
     # The score differs by 10, the information is 25: by 0.4, two standard errors.
@@ -118,9 +118,12 @@ def test_what_went_wrong_is_a_warning(changes, found):
 @pytest.mark.parametrize(
     ("changes", "found"),
     [
-        ({"judged": None}, "nothing says whether other logs get more likely"),
-        ({"judged": Judged(np.ones(2), np.zeros(2))}, "the held-out logs got less likely"),
-        ({"judged": Judged(np.ones(2), np.full(2, np.nan))}, "the held-out logs got less likely"),
+        ({"judged": None}, "whether other logs become more likely is unknown"),
+        ({"judged": Judged(np.ones(2), np.zeros(2))}, "the held-out logs became less likely"),
+        (
+            {"judged": Judged(np.ones(2), np.full(2, np.nan))},
+            "the held-out logs became less likely",
+        ),
         ({"errors": make_errors(log_z_sd=2.0)}, "spreads by 2 nats over seeds, above 1.5"),
         ({"errors": make_errors(log_z_sd=np.nan)}, "spreads by nan nats"),
     ],

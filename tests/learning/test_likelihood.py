@@ -146,7 +146,7 @@ def small(steps=6):
 
 @pytest.fixture(scope="module")
 def scored():
-    """A small problem, what can be learnt, and its `Score`."""
+    """A small problem, what can be learned, and its `Score`."""
     with jax.enable_x64(True):
         log, params, config = small()
         names, data = likelihood.learnable(config), likelihood.data_from_log(log, config)
@@ -271,16 +271,16 @@ def test_what_is_refused():
     for names, told in (
         (
             ("extra_bearing_noise",),
-            "'extra_bearing_noise' can't be learnt with sensor range_bearing; these can: err_tran,",
+            "'extra_bearing_noise' can't be learned with sensor range_bearing; these can: err_tran",
         ),
-        (("inv_depth_sd",), "'inv_depth_sd' can't be learnt"),
-        (("position_scale",), "'position_scale' can't be learnt"),
+        (("inv_depth_sd",), "'inv_depth_sd' can't be learned"),
+        (("position_scale",), "'position_scale' can't be learned"),
     ):
         with pytest.raises(ValueError, match=told):
             likelihood.score(params, log, KEY, config, names)
     certain = Config(clutter=False)
     assert "outlier" not in likelihood.learnable(certain)
-    with pytest.raises(ValueError, match="'outlier' can't be learnt"):
+    with pytest.raises(ValueError, match="'outlier' can't be learned"):
         likelihood.score(params, log, KEY, certain, ("outlier",))
     with pytest.raises(ValueError, match="estimator: 'score' is not one of fisher, pathwise, pla"):
         score_estimators.score(params, log, KEY, config, (), "score")

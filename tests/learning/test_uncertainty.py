@@ -88,7 +88,7 @@ def test_combinations_that_a_log_leaves_open_are_named():
 
 def test_what_nothing_is_known_of_stays_finite():
     covariance = uncertainty.invert(np.diag([25.0, 0.0]))
-    assert covariance[1, 1] == pytest.approx(uncertainty.FAINT**2)
+    assert covariance[1, 1] == pytest.approx(uncertainty.PRIOR**2)
     assert covariance[0, 0] == pytest.approx(0.04, rel=0.01)
     widths = uncertainty.half_widths(np.diag([25.0, 0.0]))
     np.testing.assert_allclose(widths, [0.1, 0.25], rtol=0.01)

@@ -72,8 +72,8 @@ def broken_off(log, config, folder, chunks, **given):
 
 
 def gone_on(log, config, folder, said=None):
-    say = None if said is None else said.append
-    with offline.Checkpoints(folder, 0, resume=True, say=say) as checkpoints:
+    report = None if said is None else said.append
+    with offline.Checkpoints(folder, 0, resume=True, report=report) as checkpoints:
         return run.run(log, config, None, 3, None, False, checkpoints)
 
 
@@ -95,7 +95,7 @@ def test_a_resumed_run_is_bit_for_bit_the_undisturbed_one(log, tmp_path, monkeyp
     assert len(list((folder / "checkpoints").iterdir())) == 2
     broken_off(log, config, folder, 4, resume=True)
     same(columns(gone_on(log, config, folder, said)), whole)
-    assert "note: goes on after step 18, from step-00000018.npz" in said
+    assert "note: resuming after step 18, from step-00000018.npz" in said
     # The end was put aside as well: nothing is filtered or compiled again.
     monkeypatch.setattr(compiled, "compile_loop", None)
     same(columns(gone_on(log, config, folder)), whole)
@@ -133,11 +133,14 @@ def test_a_broken_checkpoint_is_said_and_the_one_before_it_taken(log, tmp_path, 
     for damaged in (flipped(content), content[:-900], b""):
         newest.write_bytes(damaged)
         said = []
-        with pytest.raises(Stop), offline.Checkpoints(folder, 0, True, say=said.append) as places:
+        with (
+            pytest.raises(Stop),
+            offline.Checkpoints(folder, 0, True, report=said.append) as places,
+        ):
             places.check_fingerprint(log, config, default_params(config.sensor, log), 3)
             assert places.restore(compiled.state_shapes(config)).done == 7
             raise Stop
-        assert sum(line.startswith("warning: a broken checkpoint is left aside: ") for line in said)
+        assert sum(line.startswith("warning: skipping a broken checkpoint: ") for line in said)
         assert newest.name in said[0]
     said = []
     same(columns(gone_on(log, config, folder, said)), whole)
@@ -145,7 +148,7 @@ def test_a_broken_checkpoint_is_said_and_the_one_before_it_taken(log, tmp_path, 
     for path in (folder / "checkpoints").iterdir():
         path.write_bytes(b"nothing")
     same(columns(gone_on(log, config, folder, said)), whole)
-    assert f"note: {folder} has nothing to go on with; starts from the beginning" in said
+    assert f"note: no checkpoint in {folder}; starting from the beginning" in said
 
 
 def flipped(content):
@@ -163,7 +166,10 @@ def test_another_run_is_not_gone_on_with(there, log, call, refuse, monkeypatch):
     resume = *LONG, "--resume"
     assert "differing: particles (30, now 41)" in refuse(*RUN[:-1], 41, "--out", "out", "--resume")
     line = refuse(*resume, "--seed", 1, "--proposal", "informed")
-    assert "out: is of another run; differing: seed (0, now 1), proposal (prior, now inf" in line
+    assert (
+        "out: the checkpoint is of another run; differing: seed (0, now 1), proposal (prior, now"
+        in line
+    )
     (there / "p.toml").write_text("sigma_range = 0.25\n")
     assert "differing: sigma_range (" in refuse(*resume, "--params", "p.toml")
     assert refuse(*resume, "--start", 0.5).endswith("; differing: frames, log\n")
@@ -220,7 +226,7 @@ def test_a_full_disk_leaves_the_old_checkpoint_and_an_exit_code(there, call, mon
         assert os.listdir("out") == ["checkpoints"]
     code, out, err = call(*LONG, "--resume")
     assert code == 0
-    assert "note: goes on after step 24, from step-00000024.npz" in err
+    assert "note: resuming after step 24, from step-00000024.npz" in err
     assert set(os.listdir("out")) <= set(run_folder.FILES)
     assert call(*RUN, "--out", "whole")[0] == 0
     assert results("out") == results("whole")
@@ -253,7 +259,7 @@ def test_at_most_two_are_kept_and_none_in_the_end(there, call, monkeypatch):
 def test_with_nothing_there_it_starts_from_the_beginning(there, call, refuse):
     code, _, err = call(*RUN, "--out", "out", "--resume")
     assert code == 0
-    assert "note: out has nothing to go on with; starts from the beginning" in err
+    assert "note: no checkpoint in out; starting from the beginning" in err
     (there / "mine").mkdir()
     (there / "mine" / "letter.txt").write_text("dear")
     assert "mine: is not a run's folder" in refuse(*RUN, "--out", "mine", "--resume")
@@ -319,7 +325,7 @@ def test_a_second_writer_is_told_of_the_first_and_ctrl_c_puts_the_run_aside(ther
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
     done = int(err.splitlines()[-1].split("after step ")[1].split()[0])
-    again = "of 24; go on with the same command and --resume"
+    again = "of 24; to resume, repeat the command with --resume"
     assert err.splitlines()[-1] == f"jaxslam: interrupted after step {done} {again}"
     assert 0 < done < 24
     assert os.listdir("out") == ["checkpoints"]
@@ -346,7 +352,7 @@ def test_ctrl_c_while_refining_says_how_to_go_on(there, call, monkeypatch):
         code, _, err = call(*refining)
     assert code == 130
     assert err.splitlines()[-1] == (
-        "jaxslam: interrupted; go on with the same command and --resume"
+        "jaxslam: interrupted; to resume, repeat the command with --resume"
     )
     assert os.listdir("out") == ["checkpoints"]
     assert call(*LONG, "--resume")[0] == 0

@@ -75,7 +75,7 @@ def test_a_checkpoint_of_a_run(old, expected, monkeypatch, capsys):
     monkeypatch.setattr(compiled, "CHUNK", 7)
     words = f"run log.npz {RUN} --no-refine --out interrupted --resume"
     assert cli.main(words.split()) == 0
-    assert "goes on after step 22" in capsys.readouterr().err
+    assert "resuming after step 22" in capsys.readouterr().err
     steps = np.load("interrupted/steps.npz")
     summary = json.loads(Path("interrupted/summary.json").read_text())
     # Bits are equal where JAX is the one that wrote it; others round otherwise.

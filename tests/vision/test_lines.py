@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from line_halves import halves
 from scipy.optimize import linear_sum_assignment
 from stripes import mirror_camera, painted, photograph, room_of_stripes, stripes
 
@@ -13,7 +14,7 @@ from jaxslam.simulation.room.furniture import furnish
 from jaxslam.simulation.room.geometry import visible_edges
 from jaxslam.simulation.room.render import PRESETS, double_mirror_camera, render_frames
 from jaxslam.vision.line_merging import merge_pieces, separate_close_pairs
-from jaxslam.vision.lines import Lines, LineSettings, extract_lines, halves, is_dark
+from jaxslam.vision.lines import Lines, LineSettings, extract_lines, is_dark
 from jaxslam.vision.overlay import draw_lines, draw_on_image
 from jaxslam.vision.panorama import panorama, unwrap
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from calibration.bundle import rotation
 from calibration.corners import board_points
+from calibration.coverage import angle_change, bearing_uncertainty
 
 
 def simulate_boards(
@@ -45,3 +46,15 @@ def _facing(towards):
     first = np.cross(towards, np.eye(3)[np.argmin(np.abs(towards))])
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(towards, first), towards], 1)
+
+
+def azimuth_error(camera, true, radius):
+    """Azimuth error [n] rad of a camera against the true one, without the common rotation, and its
+    standard deviation [n] by `bearing_uncertainty`, at the same pixels."""
+    stated = bearing_uncertainty(camera, radius)
+    usable = np.isfinite(stated.sigma)
+    pixel = stated.pixel[usable]
+    ray, real = camera.ray(pixel), true.ray(pixel)
+    inside = np.isfinite(real).all(1)
+    error = angle_change(real[inside], (ray - real)[inside, :, None])[0][:, 0]
+    return error, stated.sigma[usable][inside]
