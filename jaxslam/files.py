@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all."""
+"""Write files and folders atomically: they appear complete or not at all."""
 
 import errno
 import os
@@ -12,10 +12,10 @@ NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 
 @contextmanager
 def atomic_write(path):
-    """A binary file that becomes `path` once it is written and on the disk.
+    """Open a binary file that becomes `path` once it is complete and on the disk.
 
-    Whatever goes wrong, the old file stays and nothing is left beside it. Raises `ValueError` where
-    the place can't be written, `OSError` where there is no space.
+    If anything fails, the old file stays and no temporary file is left. Raises `ValueError` if the
+    path can't be written, `OSError` if there is no space.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -34,7 +34,7 @@ def atomic_write(path):
 
 
 def move_folder(partial, target, overwrite):
-    """Rename the folder `partial` to `target`, with `overwrite` in place of one that is there."""
+    """Rename the folder `partial` to `target`; `overwrite`: replace a folder that exists."""
     old = temporary_sibling(target) if overwrite and target.exists() else None
     if old:
         os.rename(target, old)
@@ -50,12 +50,12 @@ def move_folder(partial, target, overwrite):
 
 
 def temporary_sibling(target):
-    """A name nobody uses, in the same folder, so that renaming it to `target` is one step."""
+    """Return an unused name in the same folder, from which renaming to `target` is atomic."""
     return target.with_name(f".{target.name}.{token_hex(4)}")
 
 
 def fsync_all(*paths):
-    """See files or folders onto the disk."""
+    """Flush files or folders to the disk."""
     for path in paths:
         handle = os.open(path, os.O_RDONLY)
         try:

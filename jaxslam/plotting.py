@@ -6,15 +6,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from jaxslam.files import atomic_write
 
 DPI = 150
-
-
-# Okabe and Ito's palette, told apart by the colour-blind too.
+# Okabe and Ito's palette, which the colour-blind can distinguish.
 TRUE, FILTER, RECKONING, LANDMARK, PLAN = "#222222", "#0072B2", "#E69F00", "#D55E00", "#9A9A9A"
-
-
 REFINED, ANCESTRAL = "#009E73", "#CC79A7"
-
-
 STYLE: dict = {
     "font.size": 10,
     "axes.titlesize": 11,
@@ -32,7 +26,7 @@ STYLE: dict = {
 
 
 def ellipses(mean, cov, sigmas=3.0, corners=49):
-    """Outlines [L, corners, 2] of the ellipses of covariances [L, 3] (xx, xy, yy) about [L, 2]."""
+    """Return outlines [L, corners, 2] of ellipses: `mean` [L, 2], `cov` [L, 3] (xx, xy, yy)."""
     xx, xy, yy = np.asarray(cov, float).reshape(-1, 3).T
     value, vector = np.linalg.eigh(np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2))
     half = vector * np.sqrt(value.clip(0))[:, None, :]
@@ -42,7 +36,7 @@ def ellipses(mean, cov, sigmas=3.0, corners=49):
 
 
 def write_figure(figure, path):
-    """Save a figure as PNG, whole or not at all."""
+    """Save a figure as PNG, atomically."""
     FigureCanvasAgg(figure)
     with atomic_write(path) as file:
         figure.savefig(file, format="png", dpi=DPI, bbox_inches="tight", pad_inches=0.12)

@@ -1,21 +1,23 @@
-"""What happened in a run and when: frames in which something did, and what became of landmarks."""
+"""The events of a run, frame by frame: what `events.jsonl` holds."""
 
 import numpy as np
 
 from jaxslam.smoother.events import FAILED, KINDS, MERGED
 
+AMBIGUOUS = 0.33  # nats: one particle in ten matches otherwise
+
 
 def list_events(result):
-    """A dict for every frame in which something happened; `t` in seconds since the first frame.
+    """Yield a dict for every frame in which something happened; `t`: seconds since the first frame.
 
-    `rejuvenated`: which landmarks (by `id`) it `found`, `dropped` or `merged` (with which), or that
-    it `failed`. `ambiguous`: rows of the log about which the particles differed, and by how much
+    `rejuvenated`: ids of the landmarks `found`, `dropped` or `merged` (each with the one that is
+    left), or that it `failed`. `ambiguous`: ambiguous measurements, as row of the log and entropy
     (nats).
     """
-    changed, unsure = _changed(result), _unsure(result)
+    changed, ambiguous = _map_changes(result), _ambiguous_rows(result)
     happened = result.resampled | (result.new > 0) | (result.overflow > 0) | result.degenerate
     happened = happened | (result.nonfinite > 0) | (result.forgotten >= 0.5)
-    happened[[*changed, *unsure]] = True
+    happened[[*changed, *ambiguous]] = True
     for step in np.flatnonzero(happened).tolist():
         event = {"step": step, "t": int(result.time[step] - result.time[0]) / 1e9}
         event["ess"] = round(float(result.ess[step]), 1)
@@ -24,56 +26,53 @@ def list_events(result):
         for name in ("new", "overflow", "nonfinite", "forgotten"):
             count = float(getattr(result, name)[step])
             event |= {name: round(count, 3)} if count else {}
-        event |= {"ambiguous": unsure[step]} if step in unsure else {}
+        event |= {"ambiguous": ambiguous[step]} if step in ambiguous else {}
         event |= {"rejuvenated": changed[step]} if step in changed else {}
         yield event
 
 
 def ambiguous_measurements(result):
-    """Frame and slot [n, 2] of the measurements about which the particles differed."""
+    """Return frame and row of the frame [n, 2] of the ambiguous measurements."""
     if result.entropy is None:
         return np.zeros((0, 2), int)
     return np.argwhere(result.entropy > AMBIGUOUS)
 
 
-def _changed(result):
-    """By frame, what rejuvenation after it did to the map."""
-    changed = {}
-    for done, kind, label, into in [] if result.events is None else result.events.tolist():
-        here = changed.setdefault(done - 1, {})
+def _map_changes(result):
+    """Return, by frame, what rejuvenation after it changed in the map."""
+    changes = {}
+    for done, kind, landmark_id, into in [] if result.events is None else result.events.tolist():
+        change = changes.setdefault(done - 1, {})
         if kind == FAILED:
-            here["failed"] = True
+            change["failed"] = True
         else:
-            one = [label, into] if kind == MERGED else label
-            here.setdefault(KINDS[kind], []).append(one)
-    return changed
+            entry = [landmark_id, into] if kind == MERGED else landmark_id
+            change.setdefault(KINDS[kind], []).append(entry)
+    return changes
 
 
-def _unsure(result):
-    """By frame, pairs of a row of the log and its entropy, where that is not small."""
-    unsure = {}
+def _ambiguous_rows(result):
+    """Return, by frame, the log's row and the entropy of each ambiguous measurement."""
+    ambiguous = {}
     for step, k in ambiguous_measurements(result).tolist():
         pair = [int(result.row[step, k]), round(float(result.entropy[step, k]), 3)]
-        unsure.setdefault(step, []).append(pair)
-    return unsure
-
-
-AMBIGUOUS = 0.33  # nats: one particle in ten holds something else
+        ambiguous.setdefault(step, []).append(pair)
+    return ambiguous
 
 
 def association_entropy(landmark_id, ancestors):
-    """Entropy [C, K], nats, of what each measurement of C frames was taken for.
+    """Return the entropy [C, K], nats, of the particles' matches of each measurement of C frames.
 
-    `landmark_id` [C, K, N] as `filter.Info`; `ancestors` [C, N]: particles count as often as they go on
-    after the frame, which is by their weight wherever they are resampled. Zero where all agree.
+    `landmark_id` [C, K, N] and `ancestors` [C, N] as in `step.Info`. Particles count as often as
+    they are continued after the frame: where they are resampled, by their weight.
     """
-    found = np.zeros(landmark_id.shape[:2], np.float32)
+    entropy = np.zeros(landmark_id.shape[:2], np.float32)
     differ = (landmark_id != landmark_id[..., :1]).any(-1)
     for c in np.flatnonzero(differ.any(1)):
-        lives = np.bincount(ancestors[c], minlength=landmark_id.shape[2])
+        copies = np.bincount(ancestors[c], minlength=landmark_id.shape[2])
         for k in np.flatnonzero(differ[c]):
-            _, held = np.unique(landmark_id[c, k], return_inverse=True)
-            share = np.bincount(held, lives) / len(lives)
+            _, match = np.unique(landmark_id[c, k], return_inverse=True)
+            share = np.bincount(match, copies) / len(copies)
             share = share[share > 0]
-            found[c, k] = max(0.0, -np.sum(share * np.log(share)))
-    return found
+            entropy[c, k] = max(0.0, -np.sum(share * np.log(share)))
+    return entropy

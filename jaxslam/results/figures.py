@@ -1,6 +1,6 @@
-"""The figures of a run: its map, its error over time, its particles. Drawn without pyplot's state.
+"""The figures of a run: its map, its error over time, its particles. Without pyplot's global state.
 
-What is estimated is drawn as it is, not aligned to the truth, since the start pose is given.
+Estimates are drawn without alignment to the truth, since the start pose is given.
 """
 
 from pathlib import Path
@@ -31,7 +31,7 @@ FIGURES = ("map.png", "error.png", "particles.png")
 
 
 def draw_figures(result, directory):
-    """Write map.png, error.png and particles.png of a result into a folder; returns their paths.
+    """Write map.png, error.png and particles.png into a folder; returns their paths.
 
     Raises `ValueError` if they can't be written.
     """
@@ -45,7 +45,7 @@ def draw_figures(result, directory):
 
 
 def draw_map(result):
-    """Figure: paths and landmarks with 3-sigma ellipses, over the plan or a box about the truth."""
+    """Draw paths and landmarks with 3-sigma ellipses, over the plan or a box about the truth."""
     log, true = result.log, truth_at(result.log.truth, result.time)
     low, high, core = _limits(result, true)
     width, height = high - low
@@ -83,25 +83,25 @@ def draw_map(result):
     return figure
 
 
-def _draw_landmarks(axes, landmarks, sign, colour, whose):
-    """Draw a map: signs and ellipses, of what can be drawn."""
+def _draw_landmarks(axes, landmarks, sign, colour, source):
+    """Draw the finite landmarks of a map: signs and ellipses."""
     mean, cov = np.reshape(landmarks.mean, (-1, 2)), np.reshape(landmarks.cov, (-1, 3))
     drawable = np.isfinite(mean).all(1) & np.isfinite(cov).all(1)
     mean, cov = mean[drawable], cov[drawable]
     if len(mean) == 0:
         return
     (signs,) = axes.plot(
-        *mean.T, sign, ms=6, mew=1.4, color=colour, label=f"{whose} landmark", zorder=5
+        *mean.T, sign, ms=6, mew=1.4, color=colour, label=f"{source} landmark", zorder=5
     )
     signs.set_path_effects([withStroke(linewidth=2.8, foreground="white")])
     outlines = LineCollection(
-        ellipses(mean, cov), colors=colour, linewidths=0.9, zorder=5, label=rf"{whose} 3$\sigma$"
+        ellipses(mean, cov), colors=colour, linewidths=0.9, zorder=5, label=rf"{source} 3$\sigma$"
     )
     axes.add_collection(outlines, autolim=False)
 
 
 def _draw_plan(axes, log, core):
-    """The floor plan; without one, the box about the truth (or the estimate)."""
+    """Draw the floor plan or, without one, the box about the truth (or the estimate)."""
     plan = log.plan
     if plan is not None and plan.image is not None:
         height, width = plan.image.shape
@@ -117,10 +117,10 @@ def _draw_plan(axes, log, core):
 
 
 def _limits(result, true):
-    """The picture's corners low, high [2] and those of the room: what is known without the filter.
+    """Return corners low, high [2] of the picture, and those of the room (plan and truth).
 
-    The picture shows the room and the filter's path; of dead reckoning and of estimated landmarks,
-    which may be anywhere, only what lies within a third of that beyond it.
+    The picture shows the room and the filter's path, and of dead reckoning and the estimated
+    landmarks, which may be anywhere, what is at most a third of that size outside.
     """
     plan, truth = result.log.plan, result.log.truth
     room = [true[has_truth(true), :2]]
@@ -146,30 +146,29 @@ def _limits(result, true):
 
 
 def _corners(points):
-    """The lower-left and upper-right corner of points [n, 2]."""
+    """Return the lower-left and upper-right corner of points [n, 2]."""
     return np.nanmin(points, 0), np.nanmax(points, 0)
 
 
 def _title(result, true, low, high):
     config = result.config
     about = f"{config.sensor}, {config.association}".replace("_", " ")
-    have = has_truth(true)
-    told = "no true path"
-    if have.any():
+    path_error = "no true path"
+    if has_truth(true).any():
         errors = [
             f"{ate(path, true, align=False)[0]:.2f} m {name}"
             for name, path in path_estimates(result).items()
             if name in ("filtered", "refined")
         ]
-        told = f"path error {', '.join(errors)} (RMSE, not aligned)"
+        path_error = f"path error {', '.join(errors)} (RMSE, not aligned)"
     return (
         f"{result.log.name}: {about}, {config.particles:,} particles\n"
-        f"{told}; {_count(result, low, high)}"
+        f"{path_error}; {_count(result, low, high)}"
     )
 
 
 def _count(result, low, high):
-    """How many landmarks there are, and how many of them the picture does not show."""
+    """Say how many landmarks there are, and how many of them are outside the picture."""
     mean = np.reshape(result.landmarks.mean, (-1, 2))
     outside = int(((mean < low) | (mean > high)).any(1).sum())
     about = [f"{len(result.refined.mean)} refined"] if result.refined is not None else []
@@ -177,15 +176,15 @@ def _count(result, low, high):
     return f"{len(mean)} landmarks" + (f" ({', '.join(about)})" if about else "")
 
 
-LINES = {  # colour, width and label of every path, from the lowest to the uppermost
-    "ancestral": (ANCESTRAL, 2.4, "ancestral"),  # wider: mostly the filter's line covers it
+LINES = {  # colour, width and label of the paths, in drawing order
+    "ancestral": (ANCESTRAL, 2.4, "ancestral"),  # wider: the filter's line covers most of it
     "filtered": (FILTER, 1.0, "filter"),
     "refined": (REFINED, 1.0, "refined"),
 }
 
 
 def draw_error(result):
-    """Figure over time: errors of position and heading beside their own 3 sigma, and drift."""
+    """Draw, over time, errors of position and heading with their own 3 sigma, and drift."""
     figure = Figure(figsize=(9.5, 7.5), layout="constrained")
     position, heading, drift = figure.subplots(3, 1, sharex=True, height_ratios=(1.25, 1, 1))
     seconds, true = _seconds(result), truth_at(result.log.truth, result.time)
@@ -221,7 +220,7 @@ def draw_error(result):
 
 
 def _draw_band(position, heading, seconds, cov, colour, label):
-    """Three sigma of poses [T, 3, 3]: of the position in the worst direction, and the heading."""
+    """Draw 3 sigma of poses [T, 3, 3]: of the position in the worst direction, of the heading."""
     xx, xy, yy = cov[:, (0, 0, 1), (0, 1, 1)].T
     largest = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
     for axes, low, band in (
@@ -233,7 +232,7 @@ def _draw_band(position, heading, seconds, cov, colour, label):
 
 
 def _curve(axes, x, y, colour, style="-", label=None, width=1.1):
-    """A line; values that have no finite neighbour, which a line can't show, are dots."""
+    """Draw a line; values without finite neighbours, which a line can't show, as dots."""
     known = np.pad(np.isfinite(y), 1)
     alone = known[1:-1] & ~known[:-2] & ~known[2:]
     axes.plot(x, y, style, color=colour, lw=width, label=label)
@@ -241,7 +240,7 @@ def _curve(axes, x, y, colour, style="-", label=None, width=1.1):
 
 
 def draw_particles(result):
-    """Figure over time: effective sample size and resampling, landmarks made and freed, clutter."""
+    """Draw, over time, effective sample size and resampling, landmarks begun and lost, clutter."""
     past, seconds = result.ancestral, _seconds(result)
     figure = Figure(figsize=(9.5, 7.0 if past is None else 8.6), layout="constrained")
     heights = (1.5, 1, 1) if past is None else (1.5, 1, 1, 1)
@@ -275,13 +274,13 @@ def draw_particles(result):
 
 
 def _draw_ancestors(axes, distinct, seconds, particles):
-    """How many ancestors the particles of the end have, by the time before it: they soon merge."""
-    before = (seconds[-1:] - seconds)[:-1]  # the end itself has no place on a logarithmic axis
+    """Draw how many ancestors the final particles have, over the time before the end."""
+    before = (seconds[-1:] - seconds)[:-1]  # a logarithmic axis can't show the end itself
     distinct = distinct[: len(before)]
     axes.step(before, distinct, color=ANCESTRAL, lw=1.6, where="mid", label="distinct ancestors")
     lone = np.flatnonzero(distinct == 1)
     if lone.size:
-        span = before[lone[-1]], before[lone[0]]  # what came before was redrawn, if anything
+        span = before[lone[-1]], before[lone[0]]  # earlier frames were redrawn, if any
         axes.axvspan(*span, color=PLAN, alpha=0.25, lw=0, label="all particles share one past")
     axes.set(xscale="log", yscale="log", ylim=(0.8, particles * 1.3), ylabel="ancestors")
     axes.set_xlabel("time before the end [s]")
@@ -293,7 +292,7 @@ def _draw_ancestors(axes, distinct, seconds, particles):
 
 
 def _draw_sample_size(axes, result, seconds):
-    """The effective sample size: its span and median in short stretches; resampling as a rug."""
+    """Draw span and median of the effective sample size in short stretches; resampling as a rug."""
     config, ess = result.config, np.asarray(result.ess, float)
     stretches = np.array_split(np.arange(ess.size), min(300, ess.size))
     at = [seconds[stretch].mean() for stretch in stretches]
@@ -316,7 +315,7 @@ def _draw_sample_size(axes, result, seconds):
 
 
 def _binned(seconds, *columns, bins=120):
-    """Edges and the means of columns [T] over equal spans of time; 0 where a span is empty."""
+    """Return edges and means of columns [T] over equal spans of time; 0 where one is empty."""
     bins = min(bins, max(len(seconds), 1))
     edges = np.linspace(0, max(seconds[-1:].max(initial=0), 1e-3), bins + 1)
     count = np.histogram(seconds, edges)[0].clip(1)
@@ -324,7 +323,7 @@ def _binned(seconds, *columns, bins=120):
 
 
 def _seconds(result):
-    """Frame times [T] in seconds since the first frame."""
+    """Return frame times [T] in seconds since the first frame."""
     return (result.time - result.time[:1]) / 1e9
 
 

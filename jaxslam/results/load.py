@@ -1,4 +1,4 @@
-"""Read a run's folder back, and draw or score it anew."""
+"""Read a run folder; draw its figures or compute its errors again."""
 
 import json
 import tomllib
@@ -20,14 +20,15 @@ from jaxslam.smoother.genealogy import Ancestral, Lineage
 
 
 def load_result(directory: str | Path, log: str | Path | None = None) -> Result:
-    """The `Result` saved in a run's folder. `log`: where its log is now, if it was moved.
+    """Load the `Result` in a run folder. `log`: path of its log, if that was moved.
 
-    Raises `ValueError` if a file is missing or broken, or if the log isn't the run's.
+    Raises `ValueError` if a file is missing or broken, or if the log is not the run's.
     """
     directory = Path(directory)
     try:
-        told = tomllib.loads((directory / "run.toml").read_text(encoding="utf-8"))
-        config, params = Config.from_dict(told["config"]), Params(**current_names(told["params"]))
+        settings = tomllib.loads((directory / "run.toml").read_text(encoding="utf-8"))
+        config = Config.from_dict(settings["config"])
+        params = Params(**current_names(settings["params"]))
         summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
         with (
             open(directory / "steps.npz", "rb") as file,
@@ -42,7 +43,7 @@ def load_result(directory: str | Path, log: str | Path | None = None) -> Result:
             }
             landmarks = MapEstimate(**_columns_of("map", steps))
             columns |= _smoother_columns(steps)
-        seed, source = told["seed"], told["log"]
+        seed, source = settings["seed"], settings["log"]
         spent = {name: summary[name] for name in ("seconds", "compile_seconds", "dropped")}
         spent["refine_seconds"] = summary.get("refine_seconds")
     except FileNotFoundError as error:
@@ -68,14 +69,14 @@ def load_result(directory: str | Path, log: str | Path | None = None) -> Result:
 
 
 def _columns_of(name, steps):
-    """The columns of `steps.npz` whose names begin so, without that; numbers as numbers."""
-    begin = f"{name}_"
-    columns = {key[len(begin) :]: steps[key] for key in steps if key.startswith(begin)}
+    """Return the columns of one table in `steps.npz`; those of no dimension as numbers."""
+    start = f"{name}_"
+    columns = {key.removeprefix(start): steps[key] for key in steps if key.startswith(start)}
     return {key: value if value.ndim else value.item() for key, value in columns.items()}
 
 
 def _smoother_columns(steps):
-    """What a run found out looking back, as far as it is there: older folders have none of it."""
+    """Return the tables of `SMOOTHED` that are there; older folders have none."""
     found = {name: _columns_of(name, steps) for name in SMOOTHED}
     kinds = {"ancestral": Ancestral, "lineage": Lineage}
     if found["refined"]:
@@ -86,7 +87,7 @@ def _smoother_columns(steps):
 
 
 def evaluate_folder(directory, log=None):
-    """The errors of a saved run, computed anew from its columns and its log's truth."""
+    """Compute the errors of a saved run again, from its columns and its log's truth."""
     return compute_errors(load_result(directory, log))
 
 
@@ -94,9 +95,9 @@ def _find_log(directory, source):
     try:
         return load_log(source if source in BUNDLED else directory / source)
     except ValueError as error:
-        raise ValueError(f"{error}; it is the log of {directory}: say --log PATH") from error
+        raise ValueError(f"{error}; it is the log of {directory}: add --log PATH") from error
 
 
 def plot_folder(directory, log=None):
-    """Draw the figures of a saved run anew; `log`: where its log is, if it was moved."""
+    """Draw the figures of a saved run again. `log`: path of its log, if that was moved."""
     return draw_figures(load_result(directory, log), directory)

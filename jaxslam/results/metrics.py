@@ -1,7 +1,7 @@
-"""How wrong a run was: path, map, pose consistency and association against the log's truth.
+"""Errors of a run against the log's truth: path, map, pose consistency and data association.
 
-NumPy, float64, on the host. Poses are (x, y, heading) in the world's frame, metres and radians.
-The start pose is given to the filter, so that unaligned errors mean something; both are reported.
+NumPy, float64. Poses are (x, y, heading) in the world frame, metres and radians. The filter starts
+at the log's start pose, so unaligned errors are meaningful; aligned ones are reported as well.
 """
 
 from typing import TYPE_CHECKING
@@ -16,11 +16,11 @@ from jaxslam.logs.truth import truth_at, wrap
 if TYPE_CHECKING:
     from jaxslam.results.result import Result
 
-GATE = 0.5  # m, the widest gate within which a landmark may be called found
+GATE = 0.5  # m: largest distance at which an estimated landmark may count as a true one
 
 
 def align_se2(estimate, truth):
-    """The motion (x, y, yaw) that carries `estimate` [T, 2] onto `truth` [T, 2] in least squares.
+    """Return the motion (x, y, yaw) from `estimate` [T, 2] to `truth` [T, 2] by least squares.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns"
     (PAMI 1991), without scale; in the plane its rotation is a single arctangent.
@@ -33,22 +33,22 @@ def align_se2(estimate, truth):
 
 
 def apply_se2(motion, points):
-    """Points [..., 2] after the motion (x, y, yaw)."""
+    """Move points [..., 2] by the motion (x, y, yaw)."""
     x, y, yaw = motion
     c, s = np.cos(yaw), np.sin(yaw)
     return np.asarray(points) @ np.array([[c, s], [-s, c]]) + np.array([x, y])
 
 
 def has_truth(truth):
-    """Which rows [T] of a true path [T, 2 or 3] have a position."""
+    """Tell which rows [T] of a true path [T, 2 or 3] have a position."""
     return np.isfinite(truth[:, :2]).all(1)
 
 
 def ate(estimate, truth, align=True):
-    """Absolute trajectory error (RMSE, maximum) in metres over the rows that have truth.
+    """Return the absolute trajectory error (RMSE, maximum), m, over the rows that have truth.
 
-    `estimate`, `truth`: [T, 2 or 3]. With `align` after the best rigid motion, which needs three
-    positions that are not one place; (NaN, NaN) where it can't be computed.
+    `estimate`, `truth`: [T, 2 or 3]. `align`: after the best rigid motion, which needs three
+    different positions. (NaN, NaN) if it can't be computed.
     """
     have = has_truth(truth)
     estimate, truth = estimate[have, :2], truth[have, :2]
@@ -61,16 +61,16 @@ def ate(estimate, truth, align=True):
 
 
 def alignable(points):
-    """Whether points [T, 2] determine a rigid motion that is more than an exact fit."""
+    """Tell whether points [T, 2] overdetermine a rigid motion."""
     return len(points) >= 3 and bool(np.ptp(points, 0).max() > 1e-6)
 
 
 def rpe(estimate, truth, distance=1.0, time=None, seconds=None):
-    """Relative pose error (m, rad), RMSE over pieces of the path [T, 3] of one length.
+    """Return the relative pose error (m, rad), RMSE over pieces of the path [T, 3] of one length.
 
     Pieces are `distance` metres along the true path or, with `time` (int64 ns) and `seconds`, of
-    that duration; they start every tenth of it, so that standing still does not weigh more. A piece
-    over a fifth too long (truth was missing) is left out. (NaN, NaN) without pieces.
+    that duration. They start every tenth of it, so that a standing robot does not count more.
+    Pieces more than a fifth too long (truth was missing) are left out. (NaN, NaN) without pieces.
     """
     have = np.isfinite(truth).all(1)
     estimate, truth = estimate[have, :3], truth[have]
@@ -101,24 +101,24 @@ def rpe(estimate, truth, distance=1.0, time=None, seconds=None):
 
 
 def relative_pose(a, b):
-    """Pose b [T, 3] seen from pose a [T, 3]."""
+    """Return poses b [T, 3] in the frames of poses a [T, 3]."""
     dx, dy = (b - a)[:, 0], (b - a)[:, 1]
     c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
     return np.stack([c * dx + s * dy, c * dy - s * dx, wrap(b[:, 2] - a[:, 2])], 1)
 
 
 def nees(pose, cov, truth, resolution=0.0):
-    """Normalised estimation error squared [T] of poses [T, 3] with covariances [T, 3, 3].
+    """Return the normalised estimation error squared [T] of poses [T, 3], covariances [T, 3, 3].
 
-    Chi-squared with 3 degrees of freedom when the filter is consistent. NaN where there is no truth
-    or the covariance is singular. Truth read to `resolution` metres adds the variance of rounding.
+    Chi-squared with 3 degrees of freedom if the filter is consistent. NaN where there is no truth
+    or the covariance is singular. `resolution` of the truth, m, adds its variance of rounding.
     """
     cov = np.asarray(cov, float) + np.diag([resolution**2 / 12, resolution**2 / 12, 0.0])
     error = pose - truth
     error[:, 2] = wrap(error[:, 2])
     sd = np.sqrt(np.einsum("tii->ti", cov))
     result = np.full(len(pose), np.nan)
-    # Scaled to correlations, so that metres and radians are alike and "singular" has one meaning.
+    # Scaled to correlations, so that "singular" does not depend on units.
     good = np.isfinite(error).all(1) & np.isfinite(cov).all((1, 2)) & (sd > 0).all(1)
     z = error[good] / sd[good]
     correlation = cov[good] / (sd[good][:, :, None] * sd[good][:, None, :])
@@ -129,35 +129,35 @@ def nees(pose, cov, truth, resolution=0.0):
 
 
 def landmark_gate(landmarks):
-    """min(0.5 m, half the smallest spacing of the true landmarks [L, 2])."""
+    """Return min(0.5 m, half the smallest distance of the true landmarks [L, 2])."""
     gap = np.hypot(*(landmarks[:, None] - landmarks[None]).transpose(2, 0, 1))
     return float(min(GATE, np.where(gap > 0, gap, np.inf).min(initial=np.inf) / 2))
 
 
 def pair_by_identity(identity, landmark_id):
-    """Rows (estimated, true) that bear the same identity; the first estimate of each counts."""
-    first = {int(who): row for row, who in reversed(list(enumerate(identity))) if who >= 0}
-    pairs = [(first[int(who)], row) for row, who in enumerate(landmark_id) if int(who) in first]
+    """Return rows (estimated, true) of equal identity, the first estimate of each."""
+    first = {int(i): row for row, i in reversed(list(enumerate(identity))) if i >= 0}
+    pairs = [(first[int(i)], row) for row, i in enumerate(landmark_id) if int(i) in first]
     return np.array(pairs, int).reshape(-1, 2)
 
 
 def pair_by_distance(mean, landmarks, gate):
-    """Rows (estimated, true) of the best one-to-one pairing of points within `gate` metres."""
+    """Return rows (estimated, true) of the best one-to-one pairs of points within `gate` metres."""
     if len(mean) == 0 or len(landmarks) == 0:
         return np.zeros((0, 2), int)
     gap = np.hypot(*(mean[:, None] - landmarks[None]).transpose(2, 0, 1))
     near = gap <= gate
-    # A pair outside the gate costs more than all pairs inside together.
+    # A pair outside the gate costs more than all pairs inside it.
     cost = np.where(near, gap**2, (1 + min(gap.shape)) * max(gate, 1e-9) ** 2)
     rows, columns = linear_sum_assignment(cost)
     return np.stack([rows, columns], 1)[near[rows, columns]]
 
 
 def map_error(mean, identity, truth, motion=None):
-    """Errors of a map [L, 2] against the true landmarks: rmse_m, matched, missed, spurious, gate_m.
+    """Return errors of a map [L, 2]: rmse_m, matched, missed, spurious, gate_m.
 
-    Known identities (any >= 0, and named in the truth) pair by identity, ungated: no gate_m. Hidden
-    ones pair one-to-one within the gate. `motion`: an alignment (x, y, yaw) applied first.
+    Known identities (any >= 0, and in the truth) pair by identity, without gate_m; unknown ones
+    one-to-one within the gate. `motion`: an alignment (x, y, yaw) applied first.
     """
     landmarks = np.asarray(truth.landmarks, float)
     mean = np.asarray(mean, float).reshape(-1, 2)
@@ -180,12 +180,12 @@ def map_error(mean, identity, truth, motion=None):
 
 
 def association_accuracy(result, log=None, landmark_id=None):
-    """The share of measurements of known origin that were told apart rightly; NaN if there is none.
+    """Return the share of correct matches of measurements of known origin; NaN if there are none.
 
-    A match is right if the measurement that created the landmark was of the same true landmark,
-    "new" if no measurement of that landmark was called new before, "clutter" if it was clutter (a
-    true identity of -1). Without true identities the measured ones serve, and -1 does not count.
-    `landmark_id` [T, K]: None for the filter's.
+    A match with a landmark is correct if the measurement that began it was of the same true
+    landmark; "new" if that was not called new before; "clutter" if the true identity is -1. Without
+    true identities the measured ones serve, and -1 does not count. `landmark_id` [T, K]: None for
+    the filter's.
     """
     log = result.log if log is None else log
     identity = None if log.truth is None else log.truth.identity
@@ -196,20 +196,20 @@ def association_accuracy(result, log=None, landmark_id=None):
     row = np.asarray(result.row).ravel()
     landmark_id = result.landmark_id if landmark_id is None else landmark_id
     landmark_id = np.asarray(landmark_id).ravel()
-    who = np.where(row >= 0, np.asarray(identity)[row.clip(0)], -1)
-    counted = (landmark_id >= -2) & (row >= 0) & ((who >= 0) | clutter_known)
-    # A landmark's label is the place (frame * K + k) of the measurement that created it.
-    right = (landmark_id >= 0) & (who >= 0) & (who[landmark_id.clip(0)] == who)
-    new = np.flatnonzero((landmark_id == -1) & (row >= 0) & (who >= 0))
-    right[new[np.unique(who[new], return_index=True)[1]]] = True
-    right |= (landmark_id == -2) & (who < 0)
-    return float(right[counted].mean()) if counted.any() else np.nan
+    true = np.where(row >= 0, np.asarray(identity)[row.clip(0)], -1)
+    counted = (landmark_id >= -2) & (row >= 0) & ((true >= 0) | clutter_known)
+    # A landmark's id is the flat index (frame * K + k) of the measurement that began it.
+    correct = (landmark_id >= 0) & (true >= 0) & (true[landmark_id.clip(0)] == true)
+    new = np.flatnonzero((landmark_id == -1) & (row >= 0) & (true >= 0))
+    correct[new[np.unique(true[new], return_index=True)[1]]] = True
+    correct |= (landmark_id == -2) & (true < 0)
+    return float(correct[counted].mean()) if counted.any() else np.nan
 
 
 def compute_errors(result: "Result", log: Log | None = None) -> dict[str, float | int]:
-    """The errors of a run for `summary.json`; a key is absent where it can't be computed.
+    """Compute the errors of a run for `summary.json`, without those that can't be computed.
 
-    Empty without truth. `log` (default: the result's own) is where the truth comes from.
+    Empty without truth. `log`: with the truth (None: the result's).
     """
     log = result.log if log is None else log
     found = {"association_accuracy": association_accuracy(result, log)}
@@ -226,7 +226,7 @@ def compute_errors(result: "Result", log: Log | None = None) -> dict[str, float 
 
 
 def path_estimates(result):
-    """The paths [T, 3] that a run has, by name: filtered, ancestral, refined, dead_reckoning."""
+    """Return the paths [T, 3] of a run by name: filtered, ancestral, refined, dead_reckoning."""
     found = {"filtered": result.pose}
     for name in ("ancestral", "refined"):
         if getattr(result, name) is not None:
@@ -235,7 +235,7 @@ def path_estimates(result):
 
 
 def path_errors(result, true, resolution):
-    """The part of `errors` that needs true poses [T, 3]."""
+    """Compute the errors that need true poses [T, 3]."""
     found = {"truth_frames": int(has_truth(true).sum())}
     if resolution > 0.1:  # coarser truth says nothing about one metre
         found["truth_resolution_m"] = float(resolution)
@@ -249,7 +249,7 @@ def path_errors(result, true, resolution):
 
 
 def _path_errors(name, path, true, resolution):
-    """Of one path [T, 3]; the names are those of summary.json."""
+    """Compute errors of one path [T, 3], by their names in summary.json."""
     ours = name != "dead_reckoning"
     (rmse, most), unaligned = ate(path, true), ate(path, true, align=False)
     ate_name = f"ate_{name}" if ours else f"{name}_ate"
@@ -276,7 +276,7 @@ def _consistency(name, pose, cov, true, resolution):
 
 
 def landmark_errors(result, truth, true):
-    """The part of `errors` that needs true landmarks; each map aligned as its path [T, 3] is."""
+    """Compute the errors that need true landmarks; each map is aligned as its path [T, 3] is."""
     found = _landmark_errors("filtered", "landmarks", result.pose, result.landmarks, truth, true)
     if result.refined is not None:
         path, world = result.refined.pose, result.landmarks_refined
@@ -285,7 +285,7 @@ def landmark_errors(result, truth, true):
 
 
 def _landmark_errors(name, counts, path, landmarks, truth, true):
-    """Of one map, whose path is [T, 3]."""
+    """Compute errors of the map that belongs to a path [T, 3]."""
     have = has_truth(true)
     kinds = {"_unaligned": None}
     if alignable(true[have, :2]):

@@ -16,8 +16,9 @@ from jaxslam.smoother.genealogy import Ancestral, Lineage
 if TYPE_CHECKING:
     from jaxslam.smoother.refine import Refined
 
-
-FEWEST, UNLIKELY, WARPED = 3, 9.2, 0.1  # landmarks; chi-square of 2 (99 %); m
+# Two maps disagree if they share so many landmarks, with so large a median chi-square of 2 (99 %)
+# and distance [m].
+MIN_LANDMARKS, MIN_CHI_SQUARE, MIN_DISTANCE = 3, 9.2, 0.1
 
 
 class MapEstimate(NamedTuple):
@@ -126,10 +127,8 @@ class Result:
     @property
     def landmarks_refined(self) -> MapEstimate | None:
         """The refined map, or None."""
-        found = self.refined
-        if found is None:
-            return None
-        return MapEstimate(found.id, found.mean, found.landmark_cov, found.n, found.identity)
+        r = self.refined
+        return r and MapEstimate(r.id, r.mean, r.landmark_cov, r.n, r.identity)
 
     @property
     def log_likelihood(self) -> float:
@@ -159,48 +158,46 @@ class Result:
         if not (np.isfinite(self.pose).all() and np.isfinite(self.cov).all()):
             lines.append("the pose estimate is not finite")
         if self.refined is None and self.refine_seconds is not None:
-            lines.append("path and map could not be refined, for want of memory or of a solution")
+            lines.append("path and map could not be refined: too little memory, or no solution")
         return lines
 
     @cached_property
     def advice(self) -> list[str]:
         """One line for everything that is no fault but should be known."""
-        return self._shared_past + self._failed + self._warped
+        return self._describe_shared_past() + self._describe_failures() + self._describe_warp()
 
-    @property
-    def _failed(self):
-        """A line if a past could not be refined on the way."""
+    def _describe_failures(self):
+        """Return a line if rejuvenation failed."""
         failed = 0 if self.events is None else int(np.sum(self.events[:, 1] == FAILED))
         if not failed:
             return []
-        return [f"the past could not be refined {failed} times; the filter went on without"]
+        return [f"rejuvenation failed {failed} times, since the path could not be refined"]
 
-    @property
-    def _warped(self):
-        """A line if the filter's map and the refined one, of the same landmarks, disagree."""
+    def _describe_warp(self):
+        """Return a line if the filter's map and the refined one, of common landmarks, disagree."""
         if self.refined is None:
             return []
-        mine, other = self.landmarks, self.landmarks_refined
-        _, i, j = np.intersect1d(mine.id, other.id, return_indices=True)
-        if len(i) < FEWEST:
+        filtered, refined = self.landmarks, self.landmarks_refined
+        _, i, j = np.intersect1d(filtered.id, refined.id, return_indices=True)
+        if len(i) < MIN_LANDMARKS:
             return []
-        off = mine.mean[i] - other.mean[j]
-        xx, xy, yy = (mine.cov[i] + other.cov[j]).T
+        off = filtered.mean[i] - refined.mean[j]
+        xx, xy, yy = (filtered.cov[i] + refined.cov[j]).T
         square = yy * off[:, 0] ** 2 - 2 * xy * off[:, 0] * off[:, 1] + xx * off[:, 1] ** 2
         square, distance = np.median(square / (xx * yy - xy**2)), np.median(np.hypot(*off.T))
-        if square < UNLIKELY or distance < WARPED:
+        if square < MIN_CHI_SQUARE or distance < MIN_DISTANCE:
             return []
         return [
             f"the filter's map and the refined one differ by {distance:.2f} m in the median, "
             f"{np.sqrt(square):.1f} standard deviations: one of them is likely warped"
         ]
 
-    @property
-    def _shared_past(self):
+    def _describe_shared_past(self):
+        """Return a line if all particles descend from one ancestor, or if that is not known."""
         if self.ancestral is None:
             return [
-                "the particles' genealogy took too much memory: only the filter's path is there"
-                + (", rejuvenated no more from then on" if self.config.rejuvenate else "")
+                "the particles' genealogy took too much memory: there is no smoothed path"
+                + (", and no rejuvenation from then on" if self.config.rejuvenate else "")
             ]
         if not len(self.time) or self.ancestral.distinct[0] > 1:
             return []
@@ -215,7 +212,7 @@ class Result:
     def save(
         self, directory: str | Path, overwrite: bool = False, log_source: str | None = None
     ) -> None:
-        """Write the run's folder (`report.save`); without a `log_source` the log is copied too."""
+        """Write the run folder (`run_folder.save`); without `log_source` with its log."""
         from jaxslam.results import run_folder  # here: it brings matplotlib
 
         run_folder.save(self, directory, overwrite=overwrite, log_source=log_source)

@@ -1,16 +1,16 @@
-"""A run's folder: written whole or not at all, and read back.
+"""Write the run folder: all of it or nothing.
 
-A long run's folder (`offline`) is there from its beginning; `summary.json` is the last to appear.
-
-`run.toml` reruns it, `summary.json` sums it up, `events.jsonl` says when something happened,
-`steps.npz` holds every column of the result. For other tools: `trajectory.tum` and `landmarks.csv`
-are the filter's, as it knew them at the time and at the end; `trajectory_refined.tum` and
-`landmarks_refined.csv` are what was refined afterwards, and are not there if nothing was.
+`run.toml` has all settings, `summary.json` the errors and warnings, `events.jsonl` what happened in
+which frame, `steps.npz` every array of the result. For other tools: `trajectory.tum` and
+`landmarks.csv` are the filter's estimates; `trajectory_refined.tum` and `landmarks_refined.csv` the
+refined ones, if there are any. The folder of a run with checkpoints (`runs.checkpoints`) exists
+from its beginning; there `summary.json` appears last.
 """
 
 import json
 import os
 import shutil
+from contextlib import contextmanager
 from dataclasses import fields
 from importlib.metadata import PackageNotFoundError, version
 from math import cos, isfinite, sin
@@ -33,11 +33,11 @@ FILE_NAMES = {
     "lineage_landmark_id": "lineage_birth",
     "refined_landmark_id": "refined_match",
 }
-NEEDED = ("run.toml", "summary.json", "steps.npz")  # without these it is no run's folder
+NEEDED = ("run.toml", "summary.json", "steps.npz")  # every run folder has these
 FINISHED = "summary.json"
 CHECKPOINTS, PARTIAL = "checkpoints", ".results"
-WORKING = (run_lock.NAME, CHECKPOINTS, PARTIAL)  # what only an unfinished run's folder holds
-SMOOTHED = ("ancestral", "lineage", "refined")  # tables of what a run may lack
+WORKING = (run_lock.NAME, CHECKPOINTS, PARTIAL)  # only in an unfinished run folder
+SMOOTHED = ("ancestral", "lineage", "refined")  # tables that not every run has
 FILES = (
     *(*NEEDED, "trajectory.tum", "landmarks.csv", "events.jsonl", "log.npz", *FIGURES),
     *("trajectory_refined.tum", "landmarks_refined.csv"),
@@ -45,40 +45,33 @@ FILES = (
 
 
 def save(result, directory, overwrite=False, log_source=None, figures=True):
-    """Write a run's folder; all of it appears at once, or nothing does.
+    """Write a run folder; all of it appears at once, or nothing does.
 
-    `log_source`: the path or name the log was loaded from, for reruns; without one the log itself
-    is stored beside the results. Raises `ValueError` for a folder that exists (unless `overwrite`
-    and it is a run's folder) or that can't be written.
+    `log_source`: path or name that the log was loaded from; without one the log is stored in the
+    folder. Raises `ValueError` if the folder can't be written, or exists and is not a run folder to
+    `overwrite`.
     """
     directory = Path(directory)
     check_target(directory, overwrite)
     target = directory.resolve()
-    try:
+    partial = temporary_sibling(target)
+    with _writing(directory, partial):
         target.parent.mkdir(parents=True, exist_ok=True)
-        partial = temporary_sibling(target)
         partial.mkdir()
-    except OSError as error:
-        raise _write_error(directory, error) from error
-    try:
         _write_files(result, partial, _log_reference(log_source, target), figures)
         move_folder(partial, target, overwrite)
-    except OSError as error:
-        raise _write_error(directory, error) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def save_into(result, directory, log_source=None):
-    """Write the results of a long run into its folder: `save` for a folder that is there.
+    """Write the results of a run with checkpoints into its folder, which exists.
 
-    Dying before `summary.json`, the last, is there leaves it unfinished. Raises `OSError` where
-    there is no space.
+    It stays unfinished until `summary.json`, the last file, is there. Raises `OSError` without
+    space on the disk.
     """
     directory = Path(directory)
     partial = directory / PARTIAL
     clear_results(directory)
-    try:
+    with _writing(directory, partial):
         partial.mkdir()
         _write_files(result, partial, _log_reference(log_source, directory.resolve()))
         for path in sorted(partial.iterdir(), key=lambda path: path.name == FINISHED):
@@ -86,37 +79,29 @@ def save_into(result, directory, log_source=None):
                 fsync_all(directory)
             os.replace(path, directory / path.name)
         fsync_all(directory)
-    except OSError as error:
-        raise _write_error(directory, error) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def clear_results(directory):
-    """Remove a run's results, whole or in part; first the file that says they are whole."""
+    """Remove a run's results, complete or not; first the file that marks them as complete."""
     shutil.rmtree(directory / PARTIAL, ignore_errors=True)
     for name in (FINISHED, *FILES):
         (directory / name).unlink(missing_ok=True)
 
 
 def check_target(directory, overwrite=False, resume=False):
-    """Raise `ValueError` if a run's folder can't be written here; to be asked before a long run.
+    """Raise `ValueError` if a run folder can't be written here; to be called before the run.
 
-    `resume`: there may be an unfinished run, or a finished one. Raises `BlockingIOError` if another
-    process is writing there.
+    `resume`: a finished or unfinished run may be there. Raises `BlockingIOError` if another process
+    is writing there.
     """
     directory = Path(directory)
-    try:
+    with _writing(directory):
         if directory.exists() or directory.is_symlink():
             run_lock.check_unlocked(directory)
             _check_existing(directory, overwrite, resume)
         parent = next(path for path in directory.resolve().parents if path.exists())
         if not parent.is_dir() or not os.access(parent, os.W_OK):
             raise ValueError(f"{directory}: can't be made in {parent}; choose another with --out")
-    except BlockingIOError:
-        raise
-    except OSError as error:
-        raise _write_error(directory, error) from error
 
 
 def _check_existing(directory, overwrite, resume):
@@ -124,23 +109,23 @@ def _check_existing(directory, overwrite, resume):
         raise ValueError(f"{directory}: is not a folder; choose another with --out")
     names = {path.name for path in directory.iterdir()}
     unfinished = FINISHED not in names and not names.isdisjoint(WORKING)
-    a_runs = unfinished or not names or names.issuperset(NEEDED)
-    if resume and a_runs:
+    is_run = unfinished or not names or names.issuperset(NEEDED)
+    if resume and is_run:
         return
     if resume:
-        raise ValueError(f"{directory}: is not a run's folder, so there is nothing to go on with")
+        raise ValueError(f"{directory}: is not a run's folder, so there is nothing to resume")
     if unfinished and not overwrite:
         raise ValueError(f"{directory}: a run is unfinished; add --resume, or --overwrite")
     if not overwrite:
         raise ValueError(f"{directory}: exists; choose another folder or add --overwrite")
-    if not a_runs:
+    if not is_run:
         raise ValueError(f"{directory}: is not a run's folder, so it is not overwritten")
-    if strange := sorted(names - {*FILES, *WORKING}):
-        raise ValueError(f"{directory}: holds {strange[0]}, not of a run, so it is not overwritten")
+    if foreign := sorted(names - {*FILES, *WORKING}):
+        raise ValueError(f"{directory}: holds {foreign[0]}, not of a run, so it is not overwritten")
 
 
 def summarise(result):
-    """`summary.json` as a dict: sizes, times, evidence, warnings, versions and the errors."""
+    """Return `summary.json` as a dict: sizes, times, evidence, warnings, versions, errors."""
     config = result.config
     return {
         "log": result.log.name,
@@ -170,23 +155,23 @@ def summarise(result):
 
 
 def _smoother_summary(result):
-    """The part of `summarise` about the genealogy and the refinement; without them, empty."""
-    told = {}
+    """The part of `summarise` about genealogy and refinement, as far as the run has them."""
+    summary = {}
     if result.ancestral is not None:
-        told["least_ancestors"] = int(np.min(result.ancestral.distinct, initial=2**31))
+        summary["least_ancestors"] = int(np.min(result.ancestral.distinct, initial=2**31))
     if result.refine_seconds is not None:
-        told["refine_seconds"] = result.refine_seconds
-    if (found := result.refined) is not None:
-        told |= {
-            "refine_rounds": int(found.rounds),
-            "refine_converged": bool(found.converged),
-            "n_landmarks_refined": len(found.mean),
+        summary["refine_seconds"] = result.refine_seconds
+    if (refined := result.refined) is not None:
+        summary |= {
+            "refine_rounds": int(refined.rounds),
+            "refine_converged": bool(refined.converged),
+            "n_landmarks_refined": len(refined.mean),
         }
-    return told
+    return summary
 
 
 def versions():
-    """Versions of what computed the run."""
+    """Return the versions of Python and of the packages that compute a run."""
     found = {"python": python_version()}
     for package in ("jaxslam", "jax", "numpy"):
         try:
@@ -197,9 +182,9 @@ def versions():
 
 
 def tum_lines(time, pose):
-    """Lines `t x y z qx qy qz qw`: seconds exact to the nanosecond, metres, unit quaternion.
+    """Yield lines `t x y z qx qy qz qw`: seconds exact to the nanosecond, m, unit quaternion.
 
-    `time` int64 ns [T], `pose` [T, 3]. Digits only, since not every reader takes exponents.
+    `time` int64 ns [T], `pose` [T, 3]. Without exponents, which not every reader accepts.
     """
     for stamp, (x, y, heading) in zip(np.asarray(time).tolist(), pose, strict=True):
         sign, (second, nano) = "-" * (stamp < 0), divmod(abs(stamp), 10**9)
@@ -208,17 +193,17 @@ def tum_lines(time, pose):
 
 
 def landmark_lines(landmarks):
-    """The lines of `landmarks.csv`; numbers with all their digits."""
+    """Yield the lines of `landmarks.csv`, numbers with all their digits."""
     yield "id,x,y,sxx,sxy,syy,n\n"
-    for who, mean, cov, n in zip(
+    for landmark_id, mean, cov, n in zip(
         landmarks.id, landmarks.mean, landmarks.cov, landmarks.n, strict=True
     ):
         numbers = ",".join(repr(float(value)) for value in (*mean, *cov))
-        yield f"{int(who)},{numbers},{int(n)}\n"
+        yield f"{int(landmark_id)},{numbers},{int(n)}\n"
 
 
 def run_toml(result, log):
-    """The text of `run.toml`: what the run was told, every value resolved."""
+    """Return the text of `run.toml`: all settings of the run, with defaults filled in."""
     lines = [
         f"name = {_toml(result.log.name)}",
         f"log = {_toml(log)}  # path (from this folder) or name",
@@ -230,7 +215,7 @@ def run_toml(result, log):
 
 
 def _write_files(result, folder, source, figures=True):
-    """Write all files of a run into a folder, and see them onto the disk."""
+    """Write all files of a run into a folder, and flush them to the disk."""
     if source is None:
         save_log(folder / "log.npz", result.log)
         source = "log.npz"
@@ -261,7 +246,7 @@ def _write_files(result, folder, source, figures=True):
 
 
 def _log_reference(log_source, target):
-    """What run.toml calls the log: a bundled name or a path; None: keep a copy of it."""
+    """Return the log's entry in run.toml, a bundled name or a path; None: store a copy."""
     if log_source is None or (str(log_source) in BUNDLED and not Path(log_source).exists()):
         return log_source
     path = Path(log_source).resolve()
@@ -269,17 +254,26 @@ def _log_reference(log_source, target):
     return None if path.is_relative_to(target) else str(path)
 
 
-def _write_error(directory, error):
-    """The error to raise instead."""
-    if error.errno in NO_SPACE:
-        return OSError(error.errno, error.strerror, str(directory))
-    return ValueError(
-        f"{directory}: can't be written ({error.strerror}); choose another with --out"
-    )
+@contextmanager
+def _writing(directory, partial=None):
+    """Raise an `OSError` within as one that names the folder, as `ValueError` unless space is short
+    or another process is writing; remove `partial` in the end."""
+    try:
+        yield
+    except BlockingIOError:
+        raise
+    except OSError as error:
+        if error.errno in NO_SPACE:
+            raise OSError(error.errno, error.strerror, str(directory)) from error
+        problem = f"can't be written ({error.strerror}); choose another with --out"
+        raise ValueError(f"{directory}: {problem}") from error
+    finally:
+        if partial:
+            shutil.rmtree(partial, ignore_errors=True)
 
 
 def _toml(value):
-    """A value as TOML: text, truth, whole number or float."""
+    """Format a text, bool, whole number or float as TOML."""
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, bool):
@@ -292,7 +286,7 @@ def _toml_table(values):
 
 
 def _json(value, indent=None):
-    """JSON text; numbers that are not finite, which JSON lacks, become null."""
+    """Format as JSON; numbers that are not finite, which JSON lacks, become null."""
     return json.dumps(_finite(value), indent=indent, ensure_ascii=False, allow_nan=False)
 
 

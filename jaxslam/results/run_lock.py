@@ -1,4 +1,4 @@
-"""One writer at a time: a lock file in a run's folder; the lock dies with its process."""
+"""Lock a run folder for one writing process; the system releases the lock when that ends."""
 
 import errno
 import os
@@ -9,16 +9,16 @@ NAME = "lock"
 
 
 def acquire(folder):
-    """Lock a folder for this process; gives the open file, which keeps the lock until it is closed.
+    """Lock a folder for this process; returns the open file, which holds the lock until closed.
 
-    Raises `BlockingIOError` naming the holder where another has it.
+    Raises `BlockingIOError`, with the name of the holder, if another process has locked it.
     """
     path = Path(folder) / NAME
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             _lock(handle, path)
-            # Its last holder may have removed the file between our opening and locking it.
+            # Its last holder may have removed the file after it was opened here.
             if path.exists() and os.path.samestat(os.stat(path), os.fstat(handle)):
                 os.truncate(handle, 0)
                 os.write(handle, f"process {os.getpid()} on {platform.node()}\n".encode())
@@ -43,11 +43,11 @@ def check_unlocked(folder):
 
 
 def _lock(handle, path):
-    import fcntl  # here: there is none on Windows, where plain runs need none
+    import fcntl  # not on Windows, where only runs with checkpoints need it
 
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         holder = path.read_text(encoding="utf-8", errors="replace").strip() or "another process"
-        told = f"is being written by {holder}"
-        raise BlockingIOError(errno.EWOULDBLOCK, told, str(path.parent)) from None
+        problem = f"is being written by {holder}"
+        raise BlockingIOError(errno.EWOULDBLOCK, problem, str(path.parent)) from None

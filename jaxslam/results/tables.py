@@ -1,12 +1,16 @@
-"""A run's errors as a table for people."""
+"""Tables of numbers as text: one formatter of columns, and the errors of a run."""
 
 from math import pi
 
-PATHS = {  # label, and the beginning of its keys, the end of the first, the beginning of the last
+PATHS = {  # label; parts of the keys: how they begin, RMSE with alignment, error at the end
     "path, filter": ("ate_filtered", "rmse_m", "filtered"),
     "path, ancestral": ("ate_ancestral", "rmse_m", "ancestral"),
     "path, refined": ("ate_refined", "rmse_m", "refined"),
     "path, dead reckoning": ("dead_reckoning_ate", "m", "dead_reckoning"),
+}
+MAPS = {  # label; how the keys of errors and of counts begin
+    "landmarks, filter": ("landmark_filtered", "landmarks"),
+    "landmarks, refined": ("landmark_refined", "landmarks_refined"),
 }
 NUMBERS = (
     ("heading_filtered_rmse_rad", "heading, filter", 180 / pi, "° RMSE, unaligned"),
@@ -24,47 +28,60 @@ NUMBERS = (
 )
 
 
+def format_table(rows, align=">", least=(0,)):
+    """Format rows of texts as lines of aligned columns, with two spaces between.
+
+    `align`: `<` or `>` of each column; `least`: least width of each. The last one given counts for
+    all further columns.
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    widths = [max(width, least[min(i, len(least) - 1)]) for i, width in enumerate(widths)]
+    sides = align.ljust(len(widths), align[-1])
+    return "\n".join(
+        "  ".join(f"{text:{s}{w}}" for text, s, w in zip(row, sides, widths, strict=True)).rstrip()
+        for row in rows
+    )
+
+
 def error_table(summary):
-    """The errors of a summary as text for people: what was estimated beside dead reckoning."""
-    text = []
+    """Format the errors in a summary: of what was estimated, and of dead reckoning."""
+    lines = []
     if "ate_filtered_unaligned_rmse_m" in summary:
-        text.append(_row(("", "aligned RMSE", "unaligned RMSE", "unaligned max", "at the end")))
+        heads = "aligned RMSE", "unaligned RMSE", "unaligned max", "at the end"
+        lines.append(_format_row("", heads))
         for label, (name, rmse, end) in PATHS.items():
             if f"{name}_unaligned_rmse_m" in summary:
                 keys = [f"{name}_{key}" for key in (rmse, "unaligned_rmse_m", "unaligned_max_m")]
-                told = [_metres(summary, key) for key in (*keys, f"{end}_end_m")]
-                text.append(_row((label, *told)))
-    for label, name, counts in (
-        ("landmarks, filter", "landmark_filtered", "landmarks"),
-        ("landmarks, refined", "landmark_refined", "landmarks_refined"),
-    ):
-        text += _map_lines(summary, label, name, counts)
+                errors = [_format_metres(summary, key) for key in (*keys, f"{end}_end_m")]
+                lines.append(_format_row(label, errors))
+    for label, (name, counts) in MAPS.items():
+        lines += _map_lines(summary, label, name, counts)
     for key, label, scale, unit in NUMBERS:
         if key in summary:
             value = summary[key] * scale
             number = f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
-            text.append(f"{label:24}{number}{unit}")
-    return "\n".join(text) if text else "The log has no truth to compare with."
+            lines.append(f"{label:24}{number}{unit}")
+    return "\n".join(lines) if lines else "The log has no truth to compare with."
 
 
 def _map_lines(summary, label, name, counts):
-    """Lines about one map: its errors, and what of the true one was found."""
+    """Lines about one map: its errors, and how many true landmarks it has."""
     if f"{counts}_unaligned_matched" not in summary:
         return []
     keys = f"{name}_rmse_m", f"{name}_unaligned_rmse_m"
-    text = [_row((label, *(_metres(summary, key) for key in keys)))]
-    for kind, place in ((counts, "aligned: "), (f"{counts}_unaligned", "unaligned: ")):
+    lines = [_format_row(label, [_format_metres(summary, key) for key in keys])]
+    for kind, title in ((counts, "aligned: "), (f"{counts}_unaligned", "unaligned: ")):
         if f"{kind}_matched" in summary:
-            told = [f"{summary[f'{kind}_{k}']} {k}" for k in ("matched", "missed", "spurious")]
-            text.append(f"{place:>24}{', '.join(told)}")
+            numbers = [f"{summary[f'{kind}_{k}']} {k}" for k in ("matched", "missed", "spurious")]
+            lines.append(f"{title:>24}{', '.join(numbers)}")
     gate = summary.get("landmark_gate_m")
-    text[-1] += f" (gate {gate:.2f} m)" if gate is not None else " (paired by identity)"
-    return text
+    lines[-1] += f" (gate {gate:.2f} m)" if gate is not None else " (paired by identity)"
+    return lines
 
 
-def _row(cells):
-    return f"{cells[0]:24}" + "".join(f"{cell:>16}" for cell in cells[1:])
+def _format_row(label, cells):
+    return format_table([(label, *cells)], "<>", (24, 14))
 
 
-def _metres(summary, key):
+def _format_metres(summary, key):
     return f"{summary[key]:.3f} m" if key in summary else "-"

@@ -32,7 +32,7 @@ def test_what_was_filtered_outlives_a_refinement_that_fails(log, call, monkeypat
 
     monkeypatch.setattr(refine, "refine", fails)
     code, _, err = call(*RUN, "--out", "out")
-    line = "path and map could not be refined, for want of memory or of a solution"
+    line = "path and map could not be refined: too little memory, or no solution"
     assert (code, err.splitlines()[-1]) == (1, f"warning: {line}")
     again = load.load_result("out")
     assert np.isfinite(again.pose).all() and again.refined is None
