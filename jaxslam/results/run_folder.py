@@ -121,8 +121,7 @@ def summarise(result):
     config = result.config
     return {
         "log": result.log.name,
-        **{key: getattr(config, key) for key in ("sensor", "association", "proposal")},
-        "descriptors": config.descriptors,
+        **{k: getattr(config, k) for k in ("sensor", "association", "proposal", "descriptors")},
         "seed": result.seed,
         "n_particles": config.particles,
         "n_steps": len(result.time),
