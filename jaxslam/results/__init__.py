@@ -2,5 +2,5 @@
 
 Read `result` first, the `Result` that `runs` assembles; then `metrics`, its errors where the log
 has truth, and `events`, what happened frame by frame. `run_folder` writes a result, with
-`figures` and under `run_lock`; `load` reads it back. `tables` prints numbers. NumPy only.
+`figures` and under `run_lock`; `load` reads it back. `tables` formats text. Without JAX.
 """

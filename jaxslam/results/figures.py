@@ -12,19 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullFormatter
 
+from jaxslam import plotting
 from jaxslam.logs.truth import truth_at, wrap
-from jaxslam.plotting import (
-    ANCESTRAL,
-    FILTER,
-    LANDMARK,
-    PLAN,
-    RECKONING,
-    REFINED,
-    STYLE,
-    TRUE,
-    ellipses,
-    write_figure,
-)
+from jaxslam.plotting import ANCESTRAL, FILTER, LANDMARK, PLAN, RECKONING, REFINED, TRUE
 from jaxslam.results.metrics import ate, has_truth, path_estimates
 
 FIGURES = ("map.png", "error.png", "particles.png")
@@ -35,12 +25,10 @@ def draw_figures(result, directory):
 
     Raises `ValueError` if they can't be written.
     """
-    directory = Path(directory)
-    paths = []
-    for name, draw in zip(FIGURES, (draw_map, draw_error, draw_particles), strict=True):
-        with matplotlib.rc_context(STYLE):
-            figure = draw(result)
-            paths.append(write_figure(figure, directory / name))
+    paths = [Path(directory) / name for name in FIGURES]
+    for path, draw in zip(paths, (draw_map, draw_error, draw_particles), strict=True):
+        with matplotlib.rc_context(plotting.STYLE):
+            plotting.write_figure(draw(result), path)
     return paths
 
 
@@ -63,23 +51,16 @@ def draw_map(result):
         axes.plot(*path[:, :2].T, color=REFINED, lw=0.9, label="refined", zorder=3.5)
     axes.plot(*log.start_pose[:2], "D", ms=6, mec="white", color=FILTER, label="start", zorder=6)
     if log.truth is not None and log.truth.landmarks is not None:
-        axes.plot(
-            *log.truth.landmarks.T, "o", ms=9, mfc="none", mec=TRUE, label="true landmark", zorder=4
-        )
-    for world, sign, colour, label in (
-        (result.landmarks, "+", LANDMARK, "filter's"),
-        (result.landmarks_refined, "x", REFINED, "refined"),
-    ):
-        if world is not None:
-            _draw_landmarks(axes, world, sign, colour, label)
+        style: dict = dict(ms=9, mfc="none", mec=TRUE, label="true landmark", zorder=4)
+        axes.plot(*log.truth.landmarks.T, "o", **style)
+    _draw_landmarks(axes, result.landmarks, "+", LANDMARK, "filter's")
+    if result.refined is not None:
+        _draw_landmarks(axes, result.landmarks_refined, "x", REFINED, "refined")
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal")
     axes.set_title(_title(result, true, low, high))
-    figure.legend(
-        *axes.get_legend_handles_labels(),
-        loc="outside lower center",
-        ncols=7 if figure.get_figwidth() > 9 else 4,
-    )
+    columns = 7 if figure.get_figwidth() > 9 else 4
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=columns)
     return figure
 
 
@@ -90,13 +71,11 @@ def _draw_landmarks(axes, landmarks, sign, colour, source):
     mean, cov = mean[drawable], cov[drawable]
     if len(mean) == 0:
         return
-    (signs,) = axes.plot(
-        *mean.T, sign, ms=6, mew=1.4, color=colour, label=f"{source} landmark", zorder=5
-    )
+    style: dict = dict(ms=6, mew=1.4, color=colour, zorder=5)
+    (signs,) = axes.plot(*mean.T, sign, label=f"{source} landmark", **style)
     signs.set_path_effects([withStroke(linewidth=2.8, foreground="white")])
-    outlines = LineCollection(
-        ellipses(mean, cov), colors=colour, linewidths=0.9, zorder=5, label=rf"{source} 3$\sigma$"
-    )
+    style = dict(colors=colour, linewidths=0.9, zorder=5, label=rf"{source} 3$\sigma$")
+    outlines = LineCollection(plotting.ellipses(mean, cov), **style)
     axes.add_collection(outlines, autolim=False)
 
 
@@ -119,8 +98,8 @@ def _draw_plan(axes, log, core):
 def _limits(result, true):
     """Return corners low, high [2] of the picture, and those of the room (plan and truth).
 
-    The picture shows the room and the filter's path, and of dead reckoning and the estimated
-    landmarks, which may be anywhere, what is at most a third of that size outside.
+    The picture shows the room, the filter's path, and those parts of dead reckoning and of the
+    estimated maps that lie within a third of its size around them.
     """
     plan, truth = result.log.plan, result.log.truth
     room = [true[has_truth(true), :2]]
@@ -151,6 +130,7 @@ def _corners(points):
 
 
 def _title(result, true, low, high):
+    """Return the map's title: settings, path errors, and landmarks, also outside the picture."""
     config = result.config
     about = f"{config.sensor}, {config.association}".replace("_", " ")
     path_error = "no true path"
@@ -161,19 +141,13 @@ def _title(result, true, low, high):
             if name in ("filtered", "refined")
         ]
         path_error = f"path error {', '.join(errors)} (RMSE, not aligned)"
-    return (
-        f"{result.log.name}: {about}, {config.particles:,} particles\n"
-        f"{path_error}; {_count(result, low, high)}"
-    )
-
-
-def _count(result, low, high):
-    """Say how many landmarks there are, and how many of them are outside the picture."""
     mean = np.reshape(result.landmarks.mean, (-1, 2))
     outside = int(((mean < low) | (mean > high)).any(1).sum())
-    about = [f"{len(result.refined.mean)} refined"] if result.refined is not None else []
-    about += [f"{outside} outside the picture"] if outside else []
-    return f"{len(mean)} landmarks" + (f" ({', '.join(about)})" if about else "")
+    counts = [f"{len(result.refined.mean)} refined"] if result.refined is not None else []
+    counts += [f"{outside} outside the picture"] if outside else []
+    landmarks = f"{len(mean)} landmarks" + (f" ({', '.join(counts)})" if counts else "")
+    about += f", {config.particles:,} particles"
+    return f"{result.log.name}: {about}\n{path_error}; {landmarks}"
 
 
 LINES = {  # colour, width and label of the paths, in drawing order
@@ -194,9 +168,9 @@ def draw_error(result):
         cov = result.refined.cov
         _draw_band(position, heading, seconds, cov, REFINED, r"refined path's own 3$\sigma$")
     reference = true if known else result.pose
-    found = path_estimates(result)
-    for name in [name for name in LINES if name in found]:
-        path, (colour, width, label) = found[name], LINES[name]
+    paths = path_estimates(result)
+    for name in [name for name in LINES if name in paths]:
+        path, (colour, width, label) = paths[name], LINES[name]
         turned = np.degrees(wrap(path - true)[:, 2])
         turned[1:][np.abs(np.diff(turned)) > 180] = np.nan  # no line across the whole panel
         error = np.hypot(*(path - true)[:, :2].T)
@@ -309,9 +283,8 @@ def _draw_sample_size(axes, result, seconds):
     axes.set(yscale="log", ylim=(least, config.particles * 1.3), ylabel="effective particles")
     axes.yaxis.set_major_formatter("{x:,.0f}")
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.set_title(
-        f"{result.log.name}: {config.particles:,} particles, resampled {ticks.size:,} times"
-    )
+    about = f"{config.particles:,} particles, resampled {ticks.size:,} times"
+    axes.set_title(f"{result.log.name}: {about}")
 
 
 def _binned(seconds, *columns, bins=120):

@@ -40,7 +40,7 @@ def apply_se2(motion, points):
 
 
 def has_truth(truth):
-    """Tell which rows [T] of a true path [T, 2 or 3] have a position."""
+    """Return the mask [T] of the rows of a true path [T, 2 or 3] that have a position."""
     return np.isfinite(truth[:, :2]).all(1)
 
 
@@ -230,8 +230,10 @@ def path_errors(result, true, resolution):
         errors["truth_resolution_m"] = float(resolution)
     for name, path in path_estimates(result).items():
         errors |= _path_errors(name, path, true, resolution)
-    errors |= _consistency("nees", result, true, resolution)
-    return errors | _consistency("nees_refined", result.refined, true, resolution)
+    for name, estimate in (("nees", result), ("nees_refined", result.refined)):
+        if estimate is not None:
+            errors |= _consistency(name, nees(estimate.pose, estimate.cov, true, resolution))
+    return errors
 
 
 def _path_errors(name, path, true, resolution):
@@ -252,12 +254,9 @@ def _path_errors(name, path, true, resolution):
     return errors
 
 
-def _consistency(name, estimate, true, resolution):
-    """Compute median NEES and share of frames in the 99 % region, if there are any."""
-    squared = np.zeros(0)
-    if estimate is not None:
-        squared = nees(estimate.pose, estimate.cov, true, resolution)
-        squared = squared[np.isfinite(squared)]
+def _consistency(name, squared):
+    """Compute the median of the finite NEES [T], and the share within the 99 % region."""
+    squared = squared[np.isfinite(squared)]
     if not squared.size:
         return {}
     within = float(np.mean(squared <= chi2.ppf(0.99, 3)))

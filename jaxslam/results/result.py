@@ -16,8 +16,8 @@ from jaxslam.smoother.genealogy import Ancestral, Lineage
 if TYPE_CHECKING:
     from jaxslam.smoother.refine import Refined
 
-# Two maps disagree if they share so many landmarks, with so large a median chi-square of 2 (99 %)
-# and distance [m].
+# From here on two maps disagree: common landmarks, median chi-square (99 % of 2 degrees of freedom)
+# and median distance [m].
 MIN_LANDMARKS, MIN_CHI_SQUARE, MIN_DISTANCE = 3, 9.2, 0.1
 
 

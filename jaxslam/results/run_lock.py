@@ -9,7 +9,7 @@ NAME = "lock"
 
 
 def acquire(folder):
-    """Lock a folder for this process; returns the open file, which holds the lock until closed.
+    """Lock a folder for this process; returns the file descriptor, which holds it until closed.
 
     Raises `BlockingIOError`, with the name of the holder, if another process has locked it.
     """

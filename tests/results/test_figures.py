@@ -8,6 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
 from small_run import make_log, make_refined, make_result
 
+from jaxslam import plotting
 from jaxslam.logs.log import FloorPlan
 from jaxslam.results import figures, load, run_folder
 from jaxslam.results.result import MapEstimate
@@ -53,7 +54,7 @@ def test_ellipses_hold_what_three_sigma_should():
     rng = np.random.default_rng(0)
     cov = np.array([[0.5, 0.3, 0.4], [2.0, -1.0, 1.0]])
     mean = np.array([[1.0, 2.0], [-5.0, 0.0]])
-    for outline, centre, (xx, xy, yy) in zip(figures.ellipses(mean, cov), mean, cov, strict=True):
+    for outline, centre, (xx, xy, yy) in zip(plotting.ellipses(mean, cov), mean, cov, strict=True):
         matrix = np.array([[xx, xy], [xy, yy]])
         offset = outline - centre
         distance = np.einsum("ci,ij,cj->c", offset, np.linalg.inv(matrix), offset)
