@@ -28,7 +28,7 @@ def atomic_write(path):
     except OSError as err:
         if err.errno in NO_SPACE:
             raise OSError(err.errno, err.strerror, str(path)) from err
-        raise ValueError(f"{path}: cannot write ({err.strerror}); choose another place") from err
+        raise ValueError(f"{path}: cannot write ({err.strerror}); choose another path") from err
     finally:
         temporary.unlink(missing_ok=True)
 

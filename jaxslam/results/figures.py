@@ -215,17 +215,17 @@ def _curve(axes, x, y, colour, style="-", label=None, width=1.1):
 
 def draw_particles(result):
     """Draw, over time, effective sample size and resampling, landmarks begun and lost, clutter."""
-    past, seconds = result.ancestral, _seconds(result)
-    figure = Figure(figsize=(9.5, 7.0 if past is None else 8.6), layout="constrained")
-    heights = (1.5, 1, 1) if past is None else (1.5, 1, 1, 1)
+    ancestral, seconds = result.ancestral, _seconds(result)
+    figure = Figure(figsize=(9.5, 7.0 if ancestral is None else 8.6), layout="constrained")
+    heights = (1.5, 1, 1) if ancestral is None else (1.5, 1, 1, 1)
     panels = figure.subplots(len(heights), 1, height_ratios=heights)
     sample, landmarks, clutter = panels[:3]
     for axes in (sample, landmarks):
         axes.sharex(clutter)
         axes.tick_params(labelbottom=False)
     _draw_sample_size(sample, result, seconds)
-    if past is not None:
-        _draw_ancestors(panels[3], past.distinct, seconds, result.config.particles)
+    if ancestral is not None:
+        _draw_ancestors(panels[3], ancestral.distinct, seconds, result.config.particles)
     for name, label, colour in (
         ("new", "created, best particle", FILTER),
         ("forgotten", "forgotten, mean of particles", LANDMARK),

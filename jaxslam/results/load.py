@@ -34,21 +34,21 @@ def load_result(directory: str | Path, log: str | Path | None = None) -> Result:
             names = {stored: name for name, stored in FILE_NAMES.items()}
             steps = {names.get(stored, stored): archive[stored] for stored in archive.files}
         columns = [f for f in fields(Result) if f.metadata]
-        known = {f.name: steps[f.name] for f in columns if f.name in steps or f.default is MISSING}
-        known["landmarks"] = MapEstimate(**_columns_of("map", steps))
-        known |= _smoother_tables(steps) | {"seed": settings["seed"]}
-        known |= {name: summary[name] for name in ("seconds", "compile_seconds", "dropped")}
-        known["refine_seconds"], source = summary.get("refine_seconds"), settings["log"]
+        values = {f.name: steps[f.name] for f in columns if f.name in steps or f.default is MISSING}
+        values["landmarks"] = MapEstimate(**_columns_of("map", steps))
+        values |= _smoother_tables(steps) | {"seed": settings["seed"]}
+        values |= {name: summary[name] for name in ("seconds", "compile_seconds", "dropped")}
+        values["refine_seconds"], source = summary.get("refine_seconds"), settings["log"]
     except FileNotFoundError as error:
         missing = Path(error.filename).name
-        raise ValueError(f"{directory}: no {missing}; not a run's folder") from None
+        raise ValueError(f"{directory}: no {missing}; not a run folder") from None
     except (OSError, KeyError, TypeError, ValueError, EOFError, BadZipFile, zlib.error) as error:
-        raise ValueError(f"{directory}: a broken run's folder ({error}); run it again") from error
-    used = _load_log_of(directory, source) if log is None else load_log(log)
-    if not np.isin(known["time"], used.frame_time).all():
-        problem = f"{used.name} is not the log of this run (frame times differ)"
+        raise ValueError(f"{directory}: a broken run folder ({error}); run it again") from error
+    run_log = _load_log_of(directory, source) if log is None else load_log(log)
+    if not np.isin(values["time"], run_log.frame_time).all():
+        problem = f"{run_log.name} is not the log of this run (frame times differ)"
         raise ValueError(f"{directory}: {problem}")
-    return Result(log=used, config=config, params=params, **known)
+    return Result(log=run_log, config=config, params=params, **values)
 
 
 def _columns_of(name, steps):

@@ -131,7 +131,7 @@ class Result:
 
     @property
     def log_likelihood(self) -> float:
-        """Log evidence of the whole log, nats."""
+        """Log evidence of all frames, nats."""
         return float(np.sum(self.log_evidence, dtype=float))
 
     @cached_property

@@ -105,15 +105,16 @@ def _check_existing(directory, overwrite, resume):
     if resume and is_run:
         return
     if resume:
-        raise ValueError(f"{directory}: is not a run's folder, so there is nothing to resume")
+        raise ValueError(f"{directory}: is not a run folder, so there is nothing to resume")
     if unfinished and not overwrite:
         raise ValueError(f"{directory}: a run is unfinished; add --resume, or --overwrite")
     if not overwrite:
         raise ValueError(f"{directory}: exists; choose another folder or add --overwrite")
     if not is_run:
-        raise ValueError(f"{directory}: is not a run's folder, so it is not overwritten")
+        raise ValueError(f"{directory}: is not a run folder, so it is not overwritten")
     if foreign := sorted(names - {*FILES, *WORKING}):
-        raise ValueError(f"{directory}: holds {foreign[0]}, not of a run, so it is not overwritten")
+        problem = f"holds {foreign[0]}, which no run writes, so it is not overwritten"
+        raise ValueError(f"{directory}: {problem}")
 
 
 def summarise(result):
@@ -159,13 +160,13 @@ def _smoother_summary(result):
 
 def versions():
     """Return the versions of Python and of the packages that compute a run."""
-    found = {"python": python_version()}
+    installed = {"python": python_version()}
     for package in ("jaxslam", "jax", "numpy"):
         try:
-            found[package] = version(package)
+            installed[package] = version(package)
         except PackageNotFoundError:
-            found[package] = "not installed"
-    return found
+            installed[package] = "not installed"
+    return installed
 
 
 def tum_lines(time, pose):

@@ -282,8 +282,8 @@ def test_logs_that_are_none(log, refuse, command):
 
 def test_folders_that_are_none(at, refuse):
     for command in ("evaluate", "plot"):
-        assert "no run.toml; not a run's folder" in refuse(command, at)
-        assert "no run.toml; not a run's folder" in refuse(command, "nowhere")
+        assert "no run.toml; not a run folder" in refuse(command, at)
+        assert "no run.toml; not a run folder" in refuse(command, "nowhere")
 
 
 def test_a_place_that_is_locked(log, refuse, monkeypatch):
@@ -296,7 +296,7 @@ def test_a_place_that_is_no_folder(log, at, refuse):
     assert "is not a folder" in refuse("run", log, "--out", "log.npz", "--overwrite")
     (at / "mine").mkdir()
     (at / "mine" / "letter.txt").write_text("dear")
-    assert "not a run's folder" in refuse("run", log, "--out", "mine", "--overwrite")
+    assert "not a run folder" in refuse("run", log, "--out", "mine", "--overwrite")
     assert "cannot write" in refuse("simulate", "planar", "no/x.npz", "--length", "2")
     assert sorted(os.listdir()) == ["log.npz", "mine"]
 

@@ -265,7 +265,7 @@ def test_broken_folders_are_named(tmp_path):
     ):
         kept = (tmp_path / "run" / name).read_bytes()
         (tmp_path / "run" / name).write_bytes(text)
-        with pytest.raises(ValueError, match="a broken run's folder"):
+        with pytest.raises(ValueError, match="a broken run folder"):
             load.load_result(tmp_path / "run")
         (tmp_path / "run" / name).write_bytes(kept)
     (tmp_path / "run" / "log.npz").unlink()

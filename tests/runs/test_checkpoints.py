@@ -259,7 +259,7 @@ def test_with_nothing_there_it_starts_from_the_beginning(there, call, refuse):
     assert "note: no checkpoint in out; starting from the beginning" in err
     (there / "mine").mkdir()
     (there / "mine" / "letter.txt").write_text("dear")
-    assert "mine: is not a run's folder" in refuse(*RUN, "--out", "mine", "--resume")
+    assert "mine: is not a run folder" in refuse(*RUN, "--out", "mine", "--resume")
     assert (there / "mine" / "letter.txt").read_text() == "dear"
     os.rename("log.npz", "out/log.npz")
     inside = "run", "out/log.npz", *LONG[2:], "--overwrite"
