@@ -63,9 +63,8 @@ def draw_map(result):
         axes.plot(*path[:, :2].T, color=REFINED, lw=0.9, label="refined", zorder=3.5)
     axes.plot(*log.start_pose[:2], "D", ms=6, mec="white", color=FILTER, label="start", zorder=6)
     if log.truth is not None and log.truth.landmarks is not None:
-        axes.plot(
-            *log.truth.landmarks.T, "o", ms=9, mfc="none", mec=TRUE, label="true landmark", zorder=4
-        )
+        style: dict = dict(ms=9, mfc="none", mec=TRUE, label="true landmark", zorder=4)
+        axes.plot(*log.truth.landmarks.T, "o", **style)
     for world, sign, colour, label in (
         (result.landmarks, "+", LANDMARK, "filter's"),
         (result.landmarks_refined, "x", REFINED, "refined"),
@@ -75,11 +74,8 @@ def draw_map(result):
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal")
     axes.set_title(_title(result, true, low, high))
-    figure.legend(
-        *axes.get_legend_handles_labels(),
-        loc="outside lower center",
-        ncols=7 if figure.get_figwidth() > 9 else 4,
-    )
+    columns = 7 if figure.get_figwidth() > 9 else 4
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=columns)
     return figure
 
 
@@ -90,9 +86,8 @@ def _draw_landmarks(axes, landmarks, sign, colour, source):
     mean, cov = mean[drawable], cov[drawable]
     if len(mean) == 0:
         return
-    (signs,) = axes.plot(
-        *mean.T, sign, ms=6, mew=1.4, color=colour, label=f"{source} landmark", zorder=5
-    )
+    style: dict = dict(ms=6, mew=1.4, color=colour, zorder=5)
+    (signs,) = axes.plot(*mean.T, sign, label=f"{source} landmark", **style)
     signs.set_path_effects([withStroke(linewidth=2.8, foreground="white")])
     outlines = LineCollection(
         ellipses(mean, cov), colors=colour, linewidths=0.9, zorder=5, label=rf"{source} 3$\sigma$"
@@ -161,10 +156,8 @@ def _title(result, true, low, high):
             if name in ("filtered", "refined")
         ]
         path_error = f"path error {', '.join(errors)} (RMSE, not aligned)"
-    return (
-        f"{result.log.name}: {about}, {config.particles:,} particles\n"
-        f"{path_error}; {_count(result, low, high)}"
-    )
+    about += f", {config.particles:,} particles"
+    return f"{result.log.name}: {about}\n{path_error}; {_count(result, low, high)}"
 
 
 def _count(result, low, high):
@@ -309,9 +302,8 @@ def _draw_sample_size(axes, result, seconds):
     axes.set(yscale="log", ylim=(least, config.particles * 1.3), ylabel="effective particles")
     axes.yaxis.set_major_formatter("{x:,.0f}")
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.set_title(
-        f"{result.log.name}: {config.particles:,} particles, resampled {ticks.size:,} times"
-    )
+    about = f"{config.particles:,} particles, resampled {ticks.size:,} times"
+    axes.set_title(f"{result.log.name}: {about}")
 
 
 def _binned(seconds, *columns, bins=120):

@@ -30,10 +30,7 @@ def load_result(directory: str | Path, log: str | Path | None = None) -> Result:
         config = Config.from_dict(settings["config"])
         params = Params(**current_names(settings["params"]))
         summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
-        with (
-            open(directory / "steps.npz", "rb") as file,
-            np.load(file, allow_pickle=False) as archive,
-        ):
+        with open(directory / "steps.npz", "rb") as f, np.load(f, allow_pickle=False) as archive:
             names = {stored: name for name, stored in FILE_NAMES.items()}
             steps = {names.get(stored, stored): archive[stored] for stored in archive.files}
             columns = {
@@ -47,24 +44,16 @@ def load_result(directory: str | Path, log: str | Path | None = None) -> Result:
         spent = {name: summary[name] for name in ("seconds", "compile_seconds", "dropped")}
         spent["refine_seconds"] = summary.get("refine_seconds")
     except FileNotFoundError as error:
-        raise ValueError(
-            f"{directory}: no {Path(error.filename).name}; not a run's folder"
-        ) from None
+        problem = f"no {Path(error.filename).name}; not a run's folder"
+        raise ValueError(f"{directory}: {problem}") from None
     except (OSError, KeyError, TypeError, ValueError, EOFError, BadZipFile, zlib.error) as error:
         raise ValueError(f"{directory}: a broken run's folder ({error}); run it again") from error
     used = _find_log(directory, source) if log is None else load_log(log)
     if not np.isin(columns["time"], used.frame_time).all():
-        raise ValueError(
-            f"{directory}: {used.name} is not the log of this run (frame times differ)"
-        )
+        problem = f"{used.name} is not the log of this run (frame times differ)"
+        raise ValueError(f"{directory}: {problem}")
     return Result(
-        log=used,
-        config=config,
-        params=params,
-        seed=seed,
-        landmarks=landmarks,
-        **columns,
-        **spent,
+        log=used, config=config, params=params, seed=seed, landmarks=landmarks, **columns, **spent
     )
 
 

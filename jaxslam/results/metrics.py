@@ -88,16 +88,10 @@ def rpe(estimate, truth, distance=1.0, time=None, seconds=None):
     start, end = start[good], end[good]
     if start.size == 0:
         return np.nan, np.nan
-    move_e, move_t = (
-        relative_pose(estimate[start], estimate[end]),
-        relative_pose(truth[start], truth[end]),
-    )
-    error = move_e - move_t
+    error = relative_pose(estimate[start], estimate[end]) - relative_pose(truth[start], truth[end])
     error[:, 2] = wrap(error[:, 2])
-    return (
-        float(np.sqrt(np.mean((error[:, :2] ** 2).sum(1)))),
-        float(np.sqrt(np.mean(error[:, 2] ** 2))),
-    )
+    square = (error[:, :2] ** 2).sum(1), error[:, 2] ** 2
+    return float(np.sqrt(np.mean(square[0]))), float(np.sqrt(np.mean(square[1])))
 
 
 def relative_pose(a, b):
@@ -165,18 +159,16 @@ def map_error(mean, identity, truth, motion=None):
         mean = apply_se2(motion, mean)
     known = truth.landmark_id is not None and (np.asarray(identity) >= 0).any()
     gate = None if known else landmark_gate(landmarks)
-    pairs = (
-        pair_by_identity(identity, truth.landmark_id)
-        if known
-        else pair_by_distance(mean, landmarks, gate)
-    )
-    found: dict = dict(
-        matched=len(pairs), missed=len(landmarks) - len(pairs), spurious=len(mean) - len(pairs)
-    )
-    if len(pairs):
+    if known:
+        pairs = pair_by_identity(identity, truth.landmark_id)
+    else:
+        pairs = pair_by_distance(mean, landmarks, gate)
+    n = len(pairs)
+    errors: dict = dict(matched=n, missed=len(landmarks) - n, spurious=len(mean) - n)
+    if n:
         error = mean[pairs[:, 0]] - landmarks[pairs[:, 1]]
-        found["rmse_m"] = float(np.sqrt(np.mean((error**2).sum(1))))
-    return found if known else found | {"gate_m": gate}
+        errors["rmse_m"] = float(np.sqrt(np.mean((error**2).sum(1))))
+    return errors if known else errors | {"gate_m": gate}
 
 
 def association_accuracy(result, log=None, landmark_id=None):
