@@ -34,15 +34,10 @@ class Corners:
         return int(self.board[-1]) + 1
 
     def of_boards(self, keep):
-        """The corners of the boards `keep` (indices), renumbered from 0."""
-        part = [self.board == b for b in keep]
-        number = np.concatenate([np.full(p.sum(), i) for i, p in enumerate(part)])
-        return Corners(
-            np.concatenate([self.pixel[p] for p in part]),
-            np.concatenate([self.point[p] for p in part]),
-            number,
-            self.size,
-        )
+        """The corners of the boards `keep` (sorted indices), renumbered from 0."""
+        index = np.concatenate([np.flatnonzero(self.board == b) for b in keep])
+        number = np.searchsorted(keep, self.board[index])
+        return Corners(self.pixel[index], self.point[index], number, self.size)
 
 
 @dataclass(frozen=True)
@@ -50,8 +45,7 @@ class Solution:
     """Camera params [P] and poses of the boards: rotations [B, 3, 3], translations [B, 3] m.
 
     `free` [P, F]: directions in which params were estimated. `residual` [n, 2] px of every corner;
-    `weight` [n]: 0 for outliers. `information` [F, F] per px^2 of the free directions, with poses
-    eliminated.
+    `weight` [n]: 0 for outliers. `information` [F, F] per px^2 along `free`, poses eliminated.
     """
 
     params: np.ndarray
@@ -152,10 +146,8 @@ class _Linearization:
         root = np.sqrt(self.solution.weight * huber)[:, None]
         r, c, p = root * self.residual, root[..., None] * self.camera, root[..., None] * self.pose
         flat = c.reshape(r.size, c.shape[-1])
-        cross, own, pull = (
-            np.add.reduceat(product, self.starts)
-            for product in (c.mT @ p, p.mT @ p, (p.mT @ r[..., None])[..., 0])
-        )
+        products = c.mT @ p, p.mT @ p, (p.mT @ r[..., None])[..., 0]
+        cross, own, pull = (np.add.reduceat(product, self.starts) for product in products)
         return flat.T @ flat, cross, own, flat.T @ r.ravel(), pull
 
     def step(self, damping):
@@ -168,12 +160,9 @@ class _Linearization:
         change = -np.linalg.lstsq(schur, right)[0]
         poses = -solved[..., -1] - solved[..., :-1] @ change
         old = self.solution
-        return replace(
-            old,
-            params=old.params + old.free @ change,
-            rotation=rotation(poses[:, :3]) @ old.rotation,
-            translation=old.translation + poses[:, 3:],
-        )
+        params, translation = old.params + old.free @ change, old.translation + poses[:, 3:]
+        turned = rotation(poses[:, :3]) @ old.rotation
+        return replace(old, params=params, rotation=turned, translation=translation)
 
     def information(self):
         """Information [F, F] per px^2 of the camera's free directions, with poses eliminated."""

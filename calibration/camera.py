@@ -82,16 +82,9 @@ def _explain_singular():
 
 @_explain_singular()
 def calibrate_camera(
-    source,
-    board=(6, 7),
-    square=0.03,
-    model="polynomial",
-    mirror=False,
-    lens="up",
-    order=None,
-    simple=False,
-    progress=None,
-):
+    source, board=(6, 7), square=0.03, model="polynomial", mirror=False, lens="up", order=None,
+    simple=False, progress=None,
+):  # fmt: skip
     """Calibrate a camera from images (folder, pattern or list) of a chessboard: `Calibration`.
 
     `board`: inner corners (per row, per column); `square` m; `order` of the polynomial: 4 to 6, or
@@ -103,36 +96,29 @@ def calibrate_camera(
     views = find_views(source, board, progress)
     _check_count(len(views.names), views.rejected)
     points = board_points(board, square)
-    options = dict(size=views.size, model=model, mirror=mirror, lens=lens, order=order,
-                   simple=simple)  # fmt: skip
     trials = []
     for variant in VARIANTS:
         corners = _gather(views.corners[variant], points, views.size, views.names)[1]
         solution = _highest_order(_fit_orders(corners, model, order, simple))
-        trials.append((_inlier_rms(solution), variant, corners, solution))
+        rms = math.sqrt(np.mean(solution.distance[solution.weight > 0] ** 2))  # of the inliers
+        trials.append((rms, variant, corners, solution))
     _, variant, corners, solution = min(trials, key=lambda trial: trial[0])
     pixels, again = _find_outliers_again(views.files, corners, solution, board)
-    result = calibrate_corners(pixels, points, names=views.names, **options)
+    result = calibrate_corners(
+        pixels, points, views.size, model, mirror, lens, order, simple, views.names
+    )
     return replace(result, variant=variant, again=again, rejected=views.rejected + result.rejected)
 
 
 @_explain_singular()
 def calibrate_corners(
-    pixels,
-    points,
-    size,
-    model="polynomial",
-    mirror=False,
-    lens="up",
-    order=None,
-    simple=False,
+    pixels, points, size, model="polynomial", mirror=False, lens="up", order=None, simple=False,
     names=None,
-):
+):  # fmt: skip
     """Calibrate a camera from corners: `Calibration`.
 
     `pixels`: a list of [n, 2] px, one per board; `points`: [n, 2] m on the board, one array for all
-    or a list; boards may be partial. `size`: (width, height) px. Other arguments and errors as in
-    `calibrate_camera`.
+    or a list; boards may be partial. `size`: (width, height) px. Otherwise as `calibrate_camera`.
     """
     if model == "polynomial" and order not in (None, *ORDERS):
         raise ValueError(f"order {order!r} of the polynomial: must be 4, 5 or 6")
@@ -154,20 +140,12 @@ def calibrate_corners(
     uncertain = bearing_uncertainty(camera, cover.radius)
     doubts = list_warnings(corners, names, cover, uncertain)
     _check_bearings(cover, uncertain, doubts)
+    order = order if model == "polynomial" else None
+    scores = {key: (fit.rms, scores.get(key, math.nan)) for key, fit in fits.items()}
     return Calibration(
-        camera=camera,
-        solution=solution,
-        corners=corners,
-        names=names,
-        rejected=rejected,
-        order=order if model == "polynomial" else None,
-        scores={key: (fit.rms, scores.get(key, math.nan)) for key, fit in fits.items()},
-        variant="given",
-        again=0,
-        coverage=cover,
-        bearings=uncertain,
-        warnings=doubts,
-    )
+        camera, solution, corners, names, rejected, order, scores, variant="given", again=0,
+        coverage=cover, bearings=uncertain, warnings=doubts,
+    )  # fmt: skip
 
 
 def cross_validate(corners, fits, model, order=None, simple=False, folds=2):
@@ -179,13 +157,11 @@ def cross_validate(corners, fits, model, order=None, simple=False, folds=2):
     length = {key: np.empty(len(corners.pixel)) for key in fits}
     for fold in range(folds):
         out = np.arange(corners.boards) % folds == fold
-        fitted, held_out = corners.of_boards(np.flatnonzero(~out)), np.flatnonzero(out)
-        held_out_corners = corners.of_boards(held_out)
+        fitted, held_out = (corners.of_boards(np.flatnonzero(part)) for part in (~out, out))
         cameras = _fit_orders(fitted, model, order, simple)
         for key, fit in fits.items():
-            poses = fit.rotation[held_out], fit.translation[held_out]
-            start = Solution(cameras[key].params, *poses)
-            predicted = adjust(model, held_out_corners, start, free_directions(model, ()))
+            start = Solution(cameras[key].params, fit.rotation[out], fit.translation[out])
+            predicted = adjust(model, held_out, start, free_directions(model, ()))
             length[key][out[corners.board]] = predicted.distance
     return length
 
@@ -292,10 +268,6 @@ def _refit_without_outliers(model, corners, solution):
     return solution
 
 
-def _inlier_rms(solution):
-    return math.sqrt(np.mean(solution.distance[solution.weight > 0] ** 2))
-
-
 def _highest_order(fits):
     """The `Solution` of the highest order."""
     return list(fits.values())[-1]
@@ -315,8 +287,7 @@ def _find_misfits(corners, solution):
 
 
 def _find_outliers_again(files, corners, solution, board):
-    """Localise outlier corners again, near where the camera predicts them: the pixels of every
-    board, and the number of corners replaced."""
+    """Localise outliers again near their predictions: pixels of every board, number replaced."""
     pixels, again = [], 0
     for b, file in enumerate(files):
         own = corners.board == b
@@ -343,14 +314,8 @@ def _make_camera(solution, corners, model, mirror, lens):
     count = len(solution.params)
     if model == "polynomial":  # an order below 6 ends early
         count = 1 + int(np.flatnonzero(solution.free.any(1))[-1])
-    camera = Camera(
-        *corners.size,
-        model,
-        solution.params[:count],
-        mirror=mirror,
-        lens=lens,
-        covariance=covariance[:count, :count],
-    )
+    params, covariance = solution.params[:count], covariance[:count, :count]
+    camera = Camera(*corners.size, model, params, mirror, lens, covariance=covariance)
     high = np.arcsin(camera.direction(corners.pixel)[:, 2].clip(-1, 1))
     return replace(camera, elevation=(float(high.min()), float(high.max())))
 
@@ -362,7 +327,5 @@ def _check_bearings(cover, uncertain, doubts):
         covered = 360 - np.degrees(cover.gap)
         raise ValueError(f"all corners lie within {covered:.0f}° of azimuth{why}")
     if not uncertain.rms_deg < WORST:
-        raise ValueError(
-            f"the boards leave the bearings uncertain by {uncertain.rms_deg:.2g}° (more than"
-            f" {WORST:g}°){why}"
-        )
+        error = f"{uncertain.rms_deg:.2g}° (more than {WORST:g}°)"
+        raise ValueError(f"the boards leave the bearings uncertain by {error}{why}")

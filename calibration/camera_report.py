@@ -14,25 +14,16 @@ LONGEST = 0.06  # of the image's width, the arrow of the largest residual withou
 
 def text(fit):
     """Residuals of every image, rejected images, coverage, bearing uncertainty, and warnings."""
-    camera = fit.camera
+    camera, bearings = fit.camera, fit.bearings
     model = camera.model + (f" of order {fit.order}" if fit.order else "")
-    corners = len(fit.corners.pixel)
-    lines = [
-        f"{model}, {camera.width} x {camera.height}: {corners} corners of {len(fit.names)} boards"
-        f" ({fit.variant})",
-        "",
-        *_residuals(fit),
-        *_rejected(fit),
-        "",
-        *_coverage(fit.coverage),
-        "",
-    ]
-    lines += [*_orders(fit), ""]
+    model += f", {camera.width} x {camera.height}"
+    boards = f"{len(fit.corners.pixel)} corners of {len(fit.names)} boards ({fit.variant})"
+    lines = [f"{model}: {boards}", "", *_residuals(fit), *_rejected(fit), ""]
+    lines += [*_coverage(fit.coverage), "", *_orders(fit), ""]
     low, high = np.degrees(camera.elevation)
-    lines += [
-        f"bearing uncertainty (1 sigma): {fit.bearings.rms_deg:.3f}° RMS,"
-        f" {fit.bearings.max_deg:.3f}° at most; elevations covered: {low:.1f}° to {high:.1f}°"
-    ]
+    uncertain = f"{bearings.rms_deg:.3f}° RMS, {bearings.max_deg:.3f}° at most"
+    covered = f"elevations covered: {low:.1f}° to {high:.1f}°"
+    lines.append(f"bearing uncertainty (1 sigma): {uncertain}; {covered}")
     return "\n".join(lines + [f"warning: {warning}" for warning in fit.warnings])
 
 
@@ -48,10 +39,8 @@ def _residuals(fit):
 
 def _rejected(fit):
     lines = [f"{fit.again} outlier corners were localised again"] if fit.again else []
-    lines += [
-        f"outlier excluded: {name}, corner {index}: {distance:.1f} px"
-        for name, index, distance in fit.outliers
-    ]
+    for name, index, distance in fit.outliers:
+        lines.append(f"outlier excluded: {name}, corner {index}: {distance:.1f} px")
     return lines + [f"rejected: {name}: {reason}" for name, reason in fit.rejected]
 
 
@@ -110,15 +99,13 @@ def _draw_residuals(axes, fit):
 
 
 def _draw_coverage(axes, fit):
-    cover = fit.coverage
+    cover, colours = fit.coverage, matplotlib.colormaps["viridis"]
     title = f"coverage: largest gap in azimuth {np.degrees(cover.gap):.0f}°"
     _image_axes(axes, fit.camera, title)
-    colours = matplotlib.colormaps["viridis"]
     centre, angle = fit.camera.params[:2], np.linspace(0, 2 * np.pi, 181)
     for i in range(1, RINGS + 1):
-        ring = i * cover.radius[1] / RINGS
-        axes.plot(*(centre[:, None] + ring * np.stack([np.cos(angle), np.sin(angle)])),
-                  color=PLAN, lw=0.7)  # fmt: skip
+        circle = i * cover.radius[1] / RINGS * np.stack([np.cos(angle), np.sin(angle)])
+        axes.plot(*(centre[:, None] + circle), color=PLAN, lw=0.7)
     for b in range(fit.corners.boards):
         own = fit.corners.pixel[fit.corners.board == b]
         axes.plot(*own.T, ".", ms=4, color=colours(b / max(fit.corners.boards - 1, 1)))
@@ -142,10 +129,9 @@ def _draw_radial(axes, fit):
     axes.set_title("radial function and its uncertainty")
     right = axes.twinx()
     at = np.hypot(*(fit.bearings.pixel - camera.params[:2]).T)[0]
-    for name, colour, sigma in (
-        ("azimuth", FILTER, fit.bearings.sigma),
-        ("angle from the axis", RECKONING, fit.bearings.polar),
-    ):
+    azimuth = "azimuth", FILTER, fit.bearings.sigma
+    polar = "angle from the axis", RECKONING, fit.bearings.polar
+    for name, colour, sigma in (azimuth, polar):
         known = np.isfinite(sigma).any(1)
         squared = np.nanmean(np.degrees(sigma[known]) ** 2, axis=1)
         right.plot(at[known], np.sqrt(squared), color=colour, ls="--", label=rf"$\sigma$ of {name}")

@@ -1,7 +1,6 @@
 """Find the corners of a chessboard in images; unusable images are rejected with a reason.
 
-`board` is the number of inner corners (per row, per column), as in OpenCV. Pixels are (u, v), with
-the centre of the first at (0, 0).
+`board`: number of inner corners (per row, per column), as in OpenCV. Pixels as in `Camera`.
 """
 
 from collections import Counter
@@ -79,18 +78,15 @@ def find_views(source, board, progress=None):
             rejected.append((name, no_board))
     good = [view for view in seen if view[2] == size and view[3] is not None]
     if not good:
-        raise ValueError(
-            f"{origin}: {no_board} in any of {len(seen)} images; count where four squares meet,"
-            " not the squares"
-        )
+        count = "count where four squares meet, not the squares"
+        raise ValueError(f"{origin}: {no_board} in any of {len(seen)} images; {count}")
     names, files, _, found = map(list, zip(*good, strict=True))
     return Views(names, files, {v: [f[v] for f in found] for v in VARIANTS}, size, rejected)
 
 
 def find_corners(grey, board):
     """Find the board in a grey image [H, W]: corners [n, 2] px by variant, or None."""
-    found = find_grid(grey, board, PLAIN)
-    accurate = find_grid(grey, board, ACCURATE)
+    found, accurate = (find_grid(grey, board, flags) for flags in (PLAIN, ACCURATE))
     found = accurate if found is None else found
     if found is None:
         return None
@@ -100,8 +96,7 @@ def find_corners(grey, board):
 
 
 def find_grid(grey, board, flags):
-    """Search for the board in the image, with more local contrast, and at twice the size, until it
-    is found: corners [n, 2] px, or None."""
+    """Find the board's corners [n, 2] px in the first of `_attempts` that shows it, or None."""
     for image, scale in _attempts(grey):
         good, corners = cv2.findChessboardCornersSB(image, tuple(board), flags=flags)
         if good:
@@ -111,6 +106,7 @@ def find_grid(grey, board, flags):
 
 
 def _attempts(grey):
+    """Yield (image, scale): as it is, with more local contrast, and at twice the size."""
     yield grey, 1
     yield cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey), 1
     if 4 * grey.size <= UPSAMPLED:  # the search's filters remove squares of a few pixels

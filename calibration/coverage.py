@@ -37,9 +37,8 @@ def coverage(camera, corners, distance):
     """`Coverage` of `Corners` on boards at `distance` [B] m."""
     offset = corners.pixel - camera.params[:2]
     radius, azimuth = np.hypot(*offset.T), np.arctan2(*offset.T[::-1])
-    count, _, _ = np.histogram2d(
-        radius, azimuth, (RINGS, SECTORS), ((0, radius.max()), (-np.pi, np.pi))
-    )
+    limits = (0, radius.max()), (-np.pi, np.pi)
+    count, _, _ = np.histogram2d(radius, azimuth, (RINGS, SECTORS), limits)
     around = np.sort(azimuth)
     gap = np.diff(around, append=around[0] + 2 * np.pi).max()
     angle = np.arccos(np.clip(camera.ray(corners.pixel)[:, 2], -1, 1))
@@ -97,9 +96,8 @@ def list_warnings(corners, names, cover, uncertain):
     if corners.boards < 6:
         found.append(f"only {corners.boards} boards: 10 or more all round are advised")
     if cover.gap > np.radians(120):
-        found.append(
-            f"no corner in {np.degrees(cover.gap):.0f}° of azimuth: move the board all round"
-        )
+        gap = f"{np.degrees(cover.gap):.0f}° of azimuth"
+        found.append(f"no corner in {gap}: move the board all round")
     if cover.distance.max() < 1.15 * cover.distance.min():
         found.append("all boards are at one distance: bring some nearer and some farther away")
     if cover.radius[0] > 0.7 * cover.radius[1]:

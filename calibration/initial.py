@@ -70,9 +70,7 @@ def _board_pose(pixel, point):
     """Columns r1, r2, t [3, 3] of a board's pose, with t3 = 0 and an arbitrary sign of row 3."""
     lateral = _homography(pixel, point)
     side = (lateral @ _homogeneous(point).T * pixel.T).sum(0)
-    lateral = lateral * (
-        1 if np.median(side) > 0 else -1
-    )  # corners lie on the side of their pixels
+    lateral = lateral * (1 if np.median(side) > 0 else -1)  # corners lie towards their pixels
     (a, b), c = (lateral[:, :2] ** 2).sum(0), lateral[:, 0] @ lateral[:, 1]
     root = np.hypot(b - a, 2 * c)  # r1 and r2 must be orthogonal and of equal length
     up = np.sqrt(np.maximum([(root + b - a) / 2, (root - b + a) / 2], 0))

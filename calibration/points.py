@@ -53,9 +53,7 @@ def point_errors(log, gain=1.0):
     of its true identity, or else the most likely within a degree of its bearing from the true pose.
     Raises `ValueError` naming what the log lacks.
     """
-    truth = log.truth
-    require(log, truth is not None and truth.time is not None, "true poses")
-    require(log, truth.landmarks is not None and len(truth.landmarks), "surveyed lines")
+    truth = _require_lines(log)
     require(log, log.point is not None, "triangulated points")
     rows = np.flatnonzero(np.isfinite(log.point).all(1))
     pose = truth_at(truth, log.frame_time, GAP)[log.frame[rows]]
@@ -70,14 +68,10 @@ def point_errors(log, gain=1.0):
     if truth.identity is not None and truth.landmark_id is not None:
         possible = truth.identity[rows][:, None] == truth.landmark_id
     distance = np.where(possible, distance, np.inf)
-    nearest = distance.argmin(1)
-    least = distance[np.arange(len(rows)), nearest]
+    nearest, least = distance.argmin(1), distance.min(1)
     kept = least < GROSS
-    counts = {
-        "points": len(rows),
-        "of no surveyed line": int(np.isinf(least).sum()),
-        "gross errors": int((np.isfinite(least) & ~kept).sum()),
-    }
+    counts = {"points": len(rows), "of no surveyed line": int(np.isinf(least).sum())}
+    counts["gross errors"] = int((np.isfinite(least) & ~kept).sum())
     require(log, kept.sum() >= LEAST, f"at least {LEAST} points near surveyed lines")
     base = np.full(len(rows), np.nan) if log.point_baseline is None else log.point_baseline[rows]
     true = lines[np.arange(len(rows)), nearest]
@@ -91,9 +85,7 @@ def identify_lines(log):
     Bearings are from the true pose; -1 (clutter) if no line is within a degree. For lines from
     images, which have no identities. Raises `ValueError` naming what the log lacks.
     """
-    truth = log.truth
-    require(log, truth is not None and truth.time is not None, "true poses")
-    require(log, truth.landmarks is not None and len(truth.landmarks), "surveyed lines")
+    truth = _require_lines(log)
     require(log, log.bearing is not None, "bearings")
     lines = in_sensor(log, truth_at(truth, log.frame_time, GAP)[log.frame], truth.landmarks)
     off = np.abs(wrap(log.bearing[:, None] - np.arctan2(lines[..., 1], lines[..., 0])))
@@ -101,6 +93,14 @@ def identify_lines(log):
     ids = np.arange(len(truth.landmarks)) if truth.landmark_id is None else truth.landmark_id
     identity = np.where(off.min(axis=1) < NEAR, ids[off.argmin(axis=1)], -1)
     return replace(log, truth=replace(truth, landmark_id=ids, identity=identity))
+
+
+def _require_lines(log):
+    """The truth of a log, which must have poses and surveyed lines."""
+    truth = log.truth
+    require(log, truth is not None and truth.time is not None, "true poses")
+    require(log, truth.landmarks is not None and len(truth.landmarks), "surveyed lines")
+    return truth
 
 
 def coverage(errors):
@@ -121,10 +121,8 @@ def compare(errors):
     for name in CANDIDATES:
         if name == "bearing normal" and not np.isfinite(errors.baseline).all():
             continue
-        scores = []
-        for half in (late, ~late):
-            values = _fit(name, errors.part(~half))
-            scores.append(_log_density(name, values, errors.part(half)))
+        halves = [(errors.part(~half), errors.part(half)) for half in (late, ~late)]
+        scores = [_log_density(name, _fit(name, fitted), other) for fitted, other in halves]
         values = _fit(name, errors)
         dof = _moments(name, values, errors)[2]
         covered = _squared_distance(name, values, errors) < _bound95(dof)
@@ -138,9 +136,8 @@ def apply_model(model, log):
     rows = np.flatnonzero(np.isfinite(log.point).all(1))
     point, base = log.point[rows], log.point_baseline
     base = np.full(len(rows), np.nan) if base is None else base[rows]
-    empty = PointErrors(
-        rows, log.frame[rows], point, point, _to_matrices(log.point_cov[rows]), base, {}
-    )
+    propagated = _to_matrices(log.point_cov[rows])
+    empty = PointErrors(rows, log.frame[rows], point, point, propagated, base, {})
     mean, cov, dof = _moments(model.name, np.array(list(model.values.values())), empty)
     if np.isfinite(dof):  # the filter assumes a normal: use the variance of Student's t
         cov = cov * dof / max(dof - 2, 0.5)
@@ -200,8 +197,7 @@ def _parallax(errors):
 def _moments(name, values, errors):
     """Mean [n, 2], covariance (or scale) [n, 2, 2] and degrees of freedom of a candidate.
 
-    Geometry is taken at the true points: at measured ones, those that erred towards the robot would
-    claim to be the sharper.
+    Geometry is taken at the true points: measured ones too near to the robot would seem sharper.
     """
     zero, at = np.zeros_like(errors.true), errors.true
     if name == "one fitted normal":
@@ -236,20 +232,18 @@ CANDIDATES = {
 
 def _fit(name, errors):
     """Fit the parameters [p] of a candidate by maximum likelihood."""
-    _, start, positive = CANDIDATES[name]
-    positive = np.array(positive)
+    start, positive = map(np.array, CANDIDATES[name][1:])
 
     def values(free):
         return np.where(positive, np.exp(np.clip(free, -20, 20)), free)
 
     start = np.where(positive, np.log(np.where(positive, start, 1.0)), start)
-    best = minimize(
-        lambda free: -_log_density(name, values(free), errors).mean(),
-        start,
-        method="Nelder-Mead",
-        options={"maxiter": 2000, "xatol": 1e-5, "fatol": 1e-8},
-    )
-    return values(best.x)
+
+    def cost(free):
+        return -_log_density(name, values(free), errors).mean()
+
+    limits = {"maxiter": 2000, "xatol": 1e-5, "fatol": 1e-8}
+    return values(minimize(cost, start, method="Nelder-Mead", options=limits).x)
 
 
 def _squared_distance(name, values, errors):
@@ -272,6 +266,4 @@ def _log_density(name, values, errors):
 
 def _bound95(dof):
     """95 % quantile of the squared distance in two dimensions."""
-    if np.isinf(dof):
-        return -2 * np.log(0.05)
-    return dof * (0.05 ** (-2 / dof) - 1)
+    return -2 * np.log(0.05) if np.isinf(dof) else dof * (0.05 ** (-2 / dof) - 1)

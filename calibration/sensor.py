@@ -25,9 +25,8 @@ OUTLIER = 5.0  # robust standard deviations
 
 
 class RangeBin(NamedTuple):
-    """Mean and standard deviation of measured minus true, at true ranges `low` to `high` [m], for
-    `count` measurements without the `outliers`. `model_sd`: `bearing_sd` by the fit. NaN without
-    ranges."""
+    """Mean and standard deviation of measured minus true at true ranges `low` to `high` [m], NaN
+    without ranges; `count` excludes the `outliers`. `model_sd`: `bearing_sd` by the fit."""
 
     low: float
     high: float
@@ -74,8 +73,8 @@ def fit(log, interval=1.0):
     require(log, truth.resolution <= COARSEST, fine)
     values, errors, counts, by_range = _fit_sensor(log)
     driven, uncertain, drive_yaw, counts["intervals"] = fit_odometry(log, interval)
-    values, errors = ({k: float(v) for k, v in part.items()}
-                      for part in (values | driven, errors | uncertain))  # fmt: skip
+    both = values | driven, errors | uncertain
+    values, errors = ({k: float(v) for k, v in part.items()} for part in both)
     return ErrorModel(values, errors, counts, by_range, interval, drive_yaw)
 
 
@@ -96,11 +95,10 @@ def _fit_sensor(log):
     )
     counts = {"measurements": len(r) + clutter, "outliers": int(far.sum()) + clutter}
     share = counts["outliers"] / counts["measurements"]
-    values = dict(
-        zip(("mount_yaw", "sigma_bearing", "landmark_extent"), best, strict=True), outlier=share
-    )
+    names = "mount_yaw", "sigma_bearing", "landmark_extent"
+    values = dict(zip(names, best, strict=True), outlier=share)
     values["mount_yaw"] = log.mounting[2] - best[0]  # turned to the left, it reads too little
-    errors = dict(zip(("mount_yaw", "sigma_bearing", "landmark_extent"), error, strict=True))
+    errors = dict(zip(names, error, strict=True))
     errors["outlier"] = np.sqrt(share * (1 - share) / counts["measurements"])
     if log.range is not None:
         values["sigma_range"] = np.sqrt(np.mean(off**2))
@@ -111,9 +109,8 @@ def _fit_sensor(log):
         numbers = int(inside.sum()), int((far & (range_bin == i)).sum())
         (mean_b, mean_r), (sd_b, sd_r) = residual[inside].mean(0), residual[inside].std(0)
         model = np.sqrt(best[1] ** 2 + best[2] ** 2 * np.mean(r[inside] ** -2.0))
-        by_range.append(
-            RangeBin(low, high, *numbers, *map(float, (mean_r, sd_r, mean_b, sd_b, model)))
-        )
+        moments = map(float, (mean_r, sd_r, mean_b, sd_b, model))
+        by_range.append(RangeBin(low, high, *numbers, *moments))
     return values, errors, counts, tuple(by_range)
 
 

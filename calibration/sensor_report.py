@@ -17,8 +17,7 @@ SHOWN = 250  # largest number of points drawn: more would cover each other
 
 
 class SensorReport(NamedTuple):
-    """`bearing`: noise of bearings and odometry; `errors` and `models` of the triangulated points,
-    None and empty for a log without points."""
+    """Noise of bearings and odometry; errors and models of points (None, empty without points)."""
 
     bearing: ErrorModel
     errors: PointErrors | None
@@ -56,9 +55,8 @@ def values(report):
 def filter_params(report, base):
     """`Params` for the filter: `base` with the estimated motion and scale of the points' errors.
 
-    `sigma_bearing` stays that of `base`: with noise as small as the lines', the few particles that
-    are drawn close to the truth would take all the weight. For the same reason the estimated
-    `position_scale` multiplies that of `base`.
+    `sigma_bearing` stays that of `base`, and the estimated `position_scale` multiplies that of
+    `base`: with noise as small as the lines', few particles would take all the weight.
     """
     estimated, _ = values(report)
     motion = {k: estimated[k] for k in ODOMETRY if k in estimated}
@@ -118,9 +116,8 @@ def draw(report, log, path):
         axes.plot(*true.T, "o", ms=8, mfc="none", mec=LANDMARK, label="surveyed line")
         axes.plot(*_sensor_poses(log)[:, :2].T, ".", ms=3, color=TRUE, label="image taken")
         axes.set(xlabel="x [m]", ylabel="y [m]", title="Points triangulated on a straight drive")
-        axes.set_aspect("equal")
-        low, high = np.min(true, axis=0) - 0.6, np.max(true, axis=0) + 0.6
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        x, y = np.stack([np.min(true, axis=0) - 0.6, np.max(true, axis=0) + 0.6], 1)
+        axes.set(xlim=x, ylim=y, aspect="equal")
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
         return write_figure(figure, path)
 

@@ -17,12 +17,8 @@ from jaxslam.vision.edges import PAD, find_edges
 from jaxslam.vision.images import check_size
 from jaxslam.vision.panorama import directions, panorama, unwrap
 
-PASSES = (
-    (0.12, 0.25),
-    (0.03, 0.12),
-    (0.02, 0.08),
-    (0.01, 0.08),
-)  # largest tilt [rad] and slope [columns per row]
+# Largest tilt [rad] and slope [columns per row] of each pass.
+PASSES = ((0.12, 0.25), (0.03, 0.12), (0.02, 0.08), (0.01, 0.08))
 LARGEST = 0.17  # rad, the largest tilt that can be found
 LENGTH, GAP = 0.18, 0.03  # rad, least length and largest gap of a line
 CONTRAST, SIGNIFICANCE = 1.2, 5.0  # grey levels per column; times the noise
@@ -39,9 +35,8 @@ BIWEIGHT = 4.685  # robust standard deviations
 class Tilt:
     """`roll` and `pitch` [rad] of the camera, as in `Camera`, and their `covariance` [2, 2].
 
-    `lines` used of `candidates` in `images` images; `per_image` (name, roll, pitch, lines) of those
-    with enough lines; `scatter` [rad]: robust standard deviation of the lines about the vertical;
-    `skipped` images by reason.
+    `lines` used of `candidates` in `images` images, `skipped` by reason; `per_image` (name, roll,
+    pitch, lines) of those with enough; `scatter` [rad]: robust deviation from the vertical.
     """
 
     roll: float
@@ -83,18 +78,13 @@ def find_tilt(images, camera, progress=None):
         previous, camera = camera, camera_with_up(camera, up)
     _check_change(nominal, camera)
     kept = weight > 0
-    residual = lines.normal[kept] @ up
-    return Tilt(
-        roll=camera.roll,
-        pitch=camera.pitch,
-        covariance=_covariance(lines, up, weight),
-        lines=int(kept.sum()),
-        candidates=len(weight),
-        images=len(normals),
-        scatter=float(1.4826 * np.median(np.abs(residual))),
-        per_image=_per_image(lines, weight, previous, names),
-        skipped=skipped,
+    counts = int(kept.sum()), len(weight), len(normals)
+    scatter = float(1.4826 * np.median(np.abs(lines.normal[kept] @ up)))
+    covariance, per_image = (
+        _covariance(lines, up, weight),
+        _per_image(lines, weight, previous, names),
     )
+    return Tilt(camera.roll, camera.pitch, covariance, *counts, scatter, per_image, skipped)
 
 
 def camera_with_tilt(camera, tilt):
@@ -105,14 +95,12 @@ def camera_with_tilt(camera, tilt):
 def describe(tilt):
     """Instructions to level the mount, in two lines."""
     roll_error, pitch_error = np.degrees(np.sqrt(np.diag(tilt.covariance)))
-    front = "raise the front" if tilt.pitch > 0 else "lower the front"
-    left = "lower the left" if tilt.roll > 0 else "raise the left"
-    return "\n".join(
-        f"{name} {angle:+.2f} +- {error:.2f} deg: {what} by {abs(angle):.2f} deg"
-        for name, angle, error, what in (
-            ("pitch", degrees(tilt.pitch), pitch_error, front),
-            ("roll", degrees(tilt.roll), roll_error, left),
-        )
+    pitch, roll = degrees(tilt.pitch), degrees(tilt.roll)
+    front = f"{'raise' if pitch > 0 else 'lower'} the front by {abs(pitch):.2f} deg"
+    left = f"{'lower' if roll > 0 else 'raise'} the left by {abs(roll):.2f} deg"
+    return (
+        f"pitch {pitch:+.2f} +- {pitch_error:.2f} deg: {front}\n"
+        f"roll {roll:+.2f} +- {roll_error:.2f} deg: {left}"
     )
 
 
@@ -159,10 +147,8 @@ def _normals(image, camera, slope, index):
     edges = find_edges(unwrap(image, view), view.valid, CONTRAST, SIGNIFICANCE, length, gap, slope)
     n = int(edges.segment.max(initial=-1)) + 1
     ray = directions(view.bearing(edges.column - PAD), view.elevation[edges.row])
-    moment = np.stack(
-        [np.bincount(edges.segment, a * b, n) for a in ray.T for b in ray.T], -1
-    ).reshape(n, 3, 3)
-    value, vector = np.linalg.eigh(moment)
+    products = [np.bincount(edges.segment, a * b, n) for a in ray.T for b in ray.T]
+    value, vector = np.linalg.eigh(np.stack(products, -1).reshape(n, 3, 3))
     count = np.bincount(edges.segment, minlength=n)
     # A normal turns about the line's middle by the scatter of its points, in blocks of rows, over
     # their lever.

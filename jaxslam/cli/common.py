@@ -89,18 +89,6 @@ def note(text):
     print(f"note: {text}", file=sys.stderr)
 
 
-def is_out_of_memory(error):
-    """Whether a `RuntimeError` is XLA's for a failed allocation: it has no type of its own, but its
-    text begins with the status code."""
-    return "RESOURCE_EXHAUSTED" in str(error)
-
-
-def is_lost_connection(error):
-    """Whether a `RuntimeError` is that of a collective over processes whose connection broke: XLA
-    passes on the text of Gloo, its transport between CPUs."""
-    return "Gloo" in str(error)
-
-
 def run_command(command, at_once=False):
     """Call a command, print an error as one line on stderr, and return the exit code.
 
@@ -130,7 +118,8 @@ def run_command(command, at_once=False):
     except ValueError as error:
         problem = str(error)
     except (MemoryError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and not is_out_of_memory(error):
+        # XLA's error of a failed allocation has no type of its own, only this status code.
+        if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise  # a bug: show the traceback
         problem = "not enough memory; ask for fewer --particles or --landmarks"
     print("jaxslam:", problem.split("\n")[0], file=sys.stderr)

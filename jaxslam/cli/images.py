@@ -5,16 +5,8 @@ from typing import Literal
 
 from cyclopts import App, Group
 
-from jaxslam.cli.common import (
-    LogName,
-    OutLog,
-    Overwrite,
-    Seed,
-    check_new,
-    option,
-    progress_bar,
-    warn,
-)
+from jaxslam.cli import common
+from jaxslam.cli.common import LogName, OutLog, Overwrite, Seed, check_new, option, progress_bar
 
 calibrate = App(name="calibrate", help="Calibrate a camera, its tilt, or a sensor's errors.")
 
@@ -25,19 +17,14 @@ CameraFile = option(Path, "Camera file: .toml, OCamCalib's .txt, or .yaml of Kal
 Camera = option(Path, "Camera file to write, a .toml file.")
 Motion = option(Path, "TOML file with parameters of the motion, from calibrate sensor.") | None
 Overlay = option(Path, "Folder, .mp4 or .avi to write: the images with their lines.") | None
+Figure = option(Path, "Picture of points and ellipses (paper, fig. 6), a .png file.") | None
 Truth = option(Path, "Folder with any of poses.csv, landmarks.csv and plan.csv.") | None
 Models = Literal["polynomial", "unified"]
 Sides = Literal["up", "down"]
 LensSide = option(Sides, "Direction of the lens on the robot.", CAMERA)
-LensOfFile = option(
-    Sides, "Direction of the lens; ignored for .toml files, which hold it.", FOREIGN
-)
-Mirror = option(
-    bool, "The camera looks into one mirror (not for two, which restore the view).", CAMERA
-)
-MirrorOfFile = option(
-    bool, "The camera looks into one mirror; ignored for .toml files, which hold it.", FOREIGN
-)
+LensOfFile = option(Sides, "Direction of the lens; a .toml file holds its own.", FOREIGN)
+Mirror = option(bool, "The camera looks into one mirror (two restore the view).", CAMERA)
+MirrorOfFile = option(bool, "The camera looks into one mirror; a .toml file holds this.", FOREIGN)
 Drives = Literal["loop", "straight", "turn"]
 Presets = Literal["clean", "normal", "hard"]
 DRIVE = "Round the room, straight along a wall, or a turn on the spot."
@@ -118,7 +105,7 @@ def tilt(
         save_camera(out, camera_with_tilt(nominal, found))
         print(f"{out}: the camera with this tilt")
     for why, count in found.skipped.items():
-        warn(f"images skipped, {count}: {why}")
+        common.warn(f"images skipped, {count}: {why}")
     return int(bool(found.skipped))
 
 
@@ -128,8 +115,7 @@ def sensor(
     /,
     *,
     out: option(Path, "TOML file to write, for --params of extract and run.") = Path("params.toml"),
-    figure: option(Path, "Picture of points and ellipses (paper, fig. 6), a .png file.")
-    | None = None,
+    figure: Figure = None,
     overwrite: Overwrite = False,
 ):
     """Fit a sensor's error model to a drive whose truth is known.
@@ -150,18 +136,16 @@ def sensor(
     if figure:
         check_new(figure, overwrite, "a picture", ".png")
         if not drive.has("position") or drive.point is None:
-            raise ValueError(
-                f"{log}: has no points to draw; omit --figure, or run jaxslam triangulate first"
-            )
+            remedy = "omit --figure, or run jaxslam triangulate first"
+            raise ValueError(f"{log}: has no points to draw; {remedy}")
     with progress_bar("fitting"):
         report = sensor_report.calibrate_sensor(drive)
     print(sensor_report.text(report))
     base = default_params("position" if report.models else "bearing", drive)
     params = sensor_report.filter_params(report, base)
     errors = sensor_report.values(report)[1]
-    save_params(
-        out, params, {k: v for k, v in errors.items() if getattr(base, k) != getattr(params, k)}
-    )
+    fitted = {k: v for k, v in errors.items() if getattr(base, k) != getattr(params, k)}
+    save_params(out, params, fitted)
     print(f"{out}: motion and position_scale, for --params of extract and run")
     if figure:
         print(f"{sensor_report.draw(report, drive, figure)}: points, ellipses, surveyed lines")
@@ -205,7 +189,7 @@ def extract(
                 overwrite=overwrite, progress=progress,
             )  # fmt: skip
     except KeyboardInterrupt:
-        warn("stopped; repeat the command to resume")
+        common.warn("stopped; repeat the command to resume")
         raise
     return _summarize(log, out)
 
@@ -288,14 +272,11 @@ def _summarize(log, out, options="", reported=()):
             print(f"{count} {why}")
         elif why not in reported:
             incomplete = True
-            warn(f"{why}: {count}")
+            common.warn(f"{why}: {count}")
     if not len(log.frame):
-        warn(
-            "no line in any image: are the images blurred, or does the camera file belong to "
-            "another camera?"
-        )
+        common.warn("no line in any image: are they blurred, or taken by another camera?")
     elif not points:
-        warn("no points: only jaxslam run --sensor bearing can map this log")
+        common.warn("no points: only jaxslam run --sensor bearing can map this log")
     else:
         print(f"map it with: jaxslam run {out}{options}")
     return int(incomplete or not points)

@@ -12,33 +12,18 @@ from typing import Literal
 
 from cyclopts import App, Parameter
 
+from jaxslam.cli import common
 from jaxslam.cli import images as cli_images
 from jaxslam.cli import learn as cli_learn
 from jaxslam.cli import run as cli_run
-from jaxslam.cli.common import (
-    DEMO,
-    PAPER,
-    LogName,
-    OutLog,
-    Overwrite,
-    ParamFile,
-    Seed,
-    Sensor,
-    at_least,
-    check_new,
-    option,
-    progress_bar,
-    run_command,
-    show_default,
-    warn,
-)
+from jaxslam.cli.common import LogName, OutLog, Overwrite, ParamFile, Seed, Sensor, at_least, option
 from jaxslam.logs.readers import FORMATS
 
 HELP = f"""FastSLAM: from a logged run to map, trajectory and figures.
 
 Start with:  jaxslam demo     (maps a real room, in two or three minutes)
-Then:        jaxslam run {DEMO} --sensor bearing --association known
-LOG is a .npz file, or {DEMO}, a log that comes with the program.
+Then:        jaxslam run {common.DEMO} --sensor bearing --association known
+LOG is a .npz file, or {common.DEMO}, a log that comes with the program.
 Each command has its own --help, with an example.
 Exit codes: 0 ok, 1 finished with warnings, 2 bad input or usage, 69 a process
 of the run is missing, 74 no space left, 75 folder in use, 130 interrupted."""
@@ -47,7 +32,7 @@ app = App(
     name="jaxslam",
     help=HELP,
     help_format="plaintext",
-    default_parameter=Parameter(negative=(), show_default=show_default),  # no --no-overwrite
+    default_parameter=Parameter(negative=(), show_default=common.show_default),  # no --no-overwrite
     suppress_keyboard_interrupt=False,
 )
 simulate = App(name="simulate", help="Simulate a drive: a log, or images, with ground truth.")
@@ -67,6 +52,10 @@ app["--help"].group = app["--version"].group = "Options"
 
 MovedLog = option(str, "Path of the run's log, if the log was moved.") | None
 Folder = option(Path, "Run folder.")
+Matching = Literal["maximum_likelihood", "known"]
+ASSOCIATION = "Data association: maximum likelihood, or identities from the log."
+EVERY = "Use every n-th frame (default: the steps cover a tenth of the log)."
+WORLD = "Landmarks on the walls of a room of 10 x 4 m, on a grid, or scattered over a field."
 
 
 @app.command
@@ -78,7 +67,9 @@ def demo(*, seed: Seed = 0):
 
     Example: jaxslam demo
     """
-    return cli_run.run(DEMO, sensor="bearing", seed=seed, out=Path("runs/demo"), overwrite=True)
+    return cli_run.run(
+        common.DEMO, sensor="bearing", seed=seed, out=Path("runs/demo"), overwrite=True
+    )
 
 
 @app.command
@@ -87,16 +78,12 @@ def compare(
     /,
     *,
     sensor: Sensor = None,
-    association: option(
-        Literal["maximum_likelihood", "known"],
-        "Data association: maximum likelihood, or identities from the log.",
-    ) = "maximum_likelihood",
+    association: option(Matching, ASSOCIATION) = "maximum_likelihood",
     params: ParamFile = None,
-    paper: option(bool, PAPER) = False,
+    paper: option(bool, common.PAPER) = False,
     particles: option(str, "Numbers of particles to compare with, separated by commas.") = "20,100",
     steps: at_least("Frames to filter.") = 200,
-    every: at_least("Use every n-th frame (default: the steps cover a tenth of the log).")
-    | None = None,
+    every: at_least(EVERY) | None = None,
     seed: Seed = 0,
 ):
     """Compare the filter with the plain NumPy reference: agreement, accuracy, time.
@@ -107,7 +94,7 @@ def compare(
     Example: jaxslam compare lost-in-the-woods --particles 20,100 --steps 200
     """
     counts = _parse_counts(particles)
-    with progress_bar("reading"):
+    with common.progress_bar("reading"):
         from jaxslam.logs.log_file import load_log
         from jaxslam.reference import compare as sides
 
@@ -115,12 +102,12 @@ def compare(
     rows = []
     for count in counts:
         model = cli_run.config_from_options(loaded, sensor, association, count, None, params, paper)
-        with progress_bar(f"{count} particles", compiles=True) as progress:
+        with common.progress_bar(f"{count} particles", compiles=True) as progress:
             rows.append(sides.compare(loaded, *model, seed, steps, every, progress))
     print(sides.table(rows))
     parted = [row.double for row in rows if row.double.same < row.double.steps]
     for row in parted:
-        warn(f"{row.particles} particles: the two part at step {row.same}")
+        common.warn(f"{row.particles} particles: the two part at step {row.same}")
     return int(bool(parted))
 
 
@@ -148,14 +135,14 @@ def convert(
     if len(paths) < 2:
         raise ValueError("convert: files to read, and the .npz file to write, are needed")
     *sources, out = paths
-    check_new(out, overwrite)
-    with progress_bar("reading"):
+    common.check_new(out, overwrite)
+    with common.progress_bar("reading"):
         log = shift_frames(read(sources, robot), time_offset)
     save_log(out, log)
     print(f"{out}: {log}; look at it with: jaxslam check {out}")
     lost = {why: n for why, n in log.skipped.items() if not why.startswith(NOT_USED)}
     for why, count in lost.items():
-        warn(f"{count} rows skipped: {why}")
+        common.warn(f"{count} rows skipped: {why}")
     return int(bool(lost))
 
 
@@ -188,7 +175,7 @@ def evaluate(
     """
     from json import dumps
 
-    with progress_bar("reading"):
+    with common.progress_bar("reading"):
         from jaxslam.results import load
         from jaxslam.results.tables import error_table
 
@@ -202,7 +189,7 @@ def plot(folder: Folder, /, *, log: MovedLog = None):
 
     Example: jaxslam plot runs/demo
     """
-    with progress_bar("drawing"):
+    with common.progress_bar("drawing"):
         from jaxslam.results.load import plot_folder
 
         paths = plot_folder(folder, log)
@@ -215,10 +202,7 @@ def planar(
     out: OutLog,
     /,
     *,
-    world: option(
-        Literal["room", "grid", "field"],
-        "Landmarks on the walls of a room of 10 x 4 m, on a grid, or scattered over a field.",
-    ) = "room",
+    world: option(Literal["room", "grid", "field"], WORLD) = "room",
     seed: Seed = 0,
     landmarks: at_least("Number of landmarks.") = 40,
     length: option(float, "Length of the path in m.") = 60.0,
@@ -245,8 +229,8 @@ def planar(
     from jaxslam.logs.log_file import save_log
     from jaxslam.simulation import planar as worlds
 
-    check_new(out, overwrite)
-    with progress_bar("simulating"):
+    common.check_new(out, overwrite)
+    with common.progress_bar("simulating"):
         log = worlds.planar(
             world, seed, landmarks=landmarks, length_m=length, speed=speed, rate_hz=rate,
             odometry_hz=odometry_rate, commands=commands, stop_m=stop, err_tran=err_tran,
@@ -261,7 +245,7 @@ def planar(
 def main(argv=None):
     """Run one command (None: of the process's arguments) and return its exit code."""
     tokens = sys.argv[1:] if argv is None else argv
-    return run_command(
+    return common.run_command(
         lambda: app(tokens, exit_on_error=False, print_error=False, result_action="return_value"),
         at_once=argv is None,
     )

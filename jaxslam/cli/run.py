@@ -10,28 +10,14 @@ from typing import Annotated, Literal, NamedTuple
 from cyclopts import Group, Parameter
 
 from jaxslam.cli import common
-from jaxslam.cli.common import (
-    LogName,
-    Overwrite,
-    ParamFile,
-    Seed,
-    Sensor,
-    at_least,
-    note,
-    option,
-    progress_bar,
-    warn,
-)
+from jaxslam.cli.common import LogName, Overwrite, ParamFile, Seed, Sensor, at_least, option
 from jaxslam.config import ASSOCIATIONS, PROPOSALS
 from jaxslam.runs import cluster, supervisor
 
 FAULT = 70  # exit code of a process that fails by a bug, reported to the other processes
-FILTER, LONG, SEVERAL, PARALLEL = map(
-    Group.create_ordered, ("Filter", "Long runs", "Several runs", "Parallel")
-)
-ASSOCIATION = (
-    "Data association: maximum likelihood, identities from the log, or sampled per particle."
-)
+HEADINGS = "Filter", "Long runs", "Several runs", "Parallel"
+FILTER, LONG, SEVERAL, PARALLEL = map(Group.create_ordered, HEADINGS)
+ASSOCIATION = "Data association: maximum likelihood, the log's identities, or sampled per particle."
 NO_SMOOTHING = "Write the filter's estimates only; do not smooth trajectory and map."
 PROPOSAL = (
     "Draw poses from odometry (prior), or from odometry and measurements (informed, the default "
@@ -49,10 +35,7 @@ DESCRIPTORS = (
 CHECKPOINT = "Save a checkpoint at this interval, e.g. 60s, 5m or 1h."
 RESUME = "Resume from the last checkpoint, if any; implies --checkpoint-every 60s."
 SEEDS = "Repeat the run for each seed, e.g. 0-9 or 1,4,7-9, and print a table."
-SWEEP = (
-    "Repeat the run for each value of a parameter, e.g. err_rot=0.05,0.1. May be given more than "
-    "once."
-)
+SWEEP = "Repeat the run for each value of a parameter, e.g. err_rot=0.05,0.1; may be repeated."
 DEVICES = "Devices of this process that share the particles, or the runs of --seeds and --sweep."
 COORDINATOR = "HOST:PORT where process 0 waits for the others; 127.0.0.1:PORT on one machine."
 PROCESSES = "Processes that share the run (default: as Slurm or Open MPI started)."
@@ -69,8 +52,7 @@ class CheckpointOptions(NamedTuple):
 class RunOptions(NamedTuple):
     """What to run and where to write it.
 
-    `name`: the log's name or path as given; `part`: only a part of that log is used; `shared`: by
-    several processes.
+    `name`: the log's name or path; `part`: only part of it is used; `shared`: by several processes.
     """
 
     log: object
@@ -84,6 +66,11 @@ class RunOptions(NamedTuple):
     no_smoothing: bool
     checkpoints: CheckpointOptions | None
     shared: bool
+
+    @property
+    def inputs(self):
+        """What determines the result: log, config, params and seed."""
+        return self.log, self.config, self.params, self.seed
 
     @property
     def source(self):
@@ -130,7 +117,7 @@ def run(
     address = cluster.find_address(coordinator, num_processes, process_id)
     if address and address.process:
         supervisor.run_supervised()
-    with progress_bar("reading", shown=address is None or address.process == 0):
+    with common.progress_bar("reading", shown=address is None or address.process == 0):
         from jaxslam.logs.log_file import load_log
         from jaxslam.logs.slicing import cut
 
@@ -199,21 +186,13 @@ def run_filter(options, checkpoints=None):
     from jaxslam.runs import run
 
     with (
-        progress_bar("filtering", compiles=True) as progress,
+        common.progress_bar("filtering", compiles=True) as progress,
         cluster.silence_stdout() if options.shared else nullcontext(),
     ):
-        result = run.run(
-            options.log,
-            options.config,
-            options.params,
-            options.seed,
-            progress,
-            refine=False,
-            checkpoints=checkpoints,
-        )
+        result = run.run(*options.inputs, progress, refine=False, checkpoints=checkpoints)
     if options.no_smoothing:
         return result
-    with progress_bar("refining") as progress:
+    with common.progress_bar("refining") as progress:
         return run.refine_result(result, progress)
 
 
@@ -238,7 +217,7 @@ def _run_at_once(options):
 
     run_folder.check_target(options.out, options.overwrite)
     result = run_filter(options)
-    with progress_bar("writing"):
+    with common.progress_bar("writing"):
         run_folder.save(result, options.out, options.overwrite, log_source=options.source)
     print_summary(result, options.out)
     return result
@@ -256,13 +235,11 @@ def _run_with_checkpoints(options):
     _check_log_outside(options)
     with checkpointing.Checkpoints(out, every, resume, overwrite) as checkpoints:
         if checkpoints.finished:
-            checkpointing.check_finished(
-                out, options.log, options.config, options.params, options.seed
-            )
+            checkpointing.check_finished(out, *options.inputs)
             print(f"{out}: is finished already; nothing to do")
             return None
         result = run_filter(options, checkpoints)
-        with progress_bar("writing"):
+        with common.progress_bar("writing"):
             run_folder.save_into(result, out, log_source=options.source)
         checkpoints.clear()
     print_summary(result, out)
@@ -272,9 +249,8 @@ def _run_with_checkpoints(options):
 def _check_log_outside(options):
     """Raise `ValueError` if the log lies in the folder whose files are replaced."""
     if Path(options.name).resolve().is_relative_to(options.out.resolve()):
-        raise ValueError(
-            f"{options.name}: is in {options.out}, where results are replaced; choose another --out"
-        )
+        why = f"is in {options.out}, where results are replaced; choose another --out"
+        raise ValueError(f"{options.name}: {why}")
 
 
 def run_shared(options, address):
@@ -283,7 +259,7 @@ def run_shared(options, address):
     from jaxslam.runs.checkpoint_file import run_fingerprint
 
     run = {
-        **run_fingerprint(options.log, options.config, options.params, options.seed),
+        **run_fingerprint(*options.inputs),
         "devices": options.config.devices,
         "out": str(options.out),
         "long": str(options.checkpoints),
@@ -311,17 +287,10 @@ def _run_as_member(options, address, group):
         wait = group.wait_for_leader
         follow = FollowerCheckpoints(options.out, wait) if options.checkpoints else None
         with cluster.silence_stdout():
-            run.run(
-                options.log,
-                options.config,
-                options.params,
-                options.seed,
-                refine=False,
-                checkpoints=follow,
-            )
+            run.run(*options.inputs, refine=False, checkpoints=follow)
         wait()
     except RuntimeError as error:
-        if not common.is_lost_connection(error):
+        if "Gloo" not in str(error):  # XLA's transport between CPUs: a broken connection
             raise
         time.sleep(cluster.EXIT_TIMEOUT)  # `group` learns which process died, and reports it
         raise ConnectionError("the connection to another process broke") from None
@@ -338,9 +307,9 @@ def print_summary(result, out):
         spent += f"; refined in {result.refine_seconds:.1f} s"
     print(f"{len(result.time)} steps in {spent}\n{out}: the map is {out / 'map.png'}")
     for line in result.advice:
-        note(line)
+        common.note(line)
     for line in result.flags:
-        warn(line)
+        common.warn(line)
 
 
 def run_batch(options, seeds, sweep, devices):
@@ -350,14 +319,13 @@ def run_batch(options, seeds, sweep, devices):
     tasks = batch.plan_tasks(seeds, options.params, sweep)
     _check_log_outside(options)
     batch.check_target(options.out, options.overwrite)
-    with progress_bar("running", compiles=True) as progress:
-        results = batch.run_tasks(
-            options.log, options.config, tasks, progress, not options.no_smoothing, devices
-        )
-    with progress_bar("writing"):
+    with common.progress_bar("running", compiles=True) as progress:
+        smooth = not options.no_smoothing
+        results = batch.run_tasks(options.log, options.config, tasks, progress, smooth, devices)
+    with common.progress_bar("writing"):
         batch.save(tasks, results, options.out, options.overwrite, options.source)
     print(batch.format_runs(batch.summary_rows(tasks, results)))
     print(f"{options.out}: the table is {options.out / batch.TABLE}, with a folder for each run")
     for line in dict.fromkeys(line for result in results for line in result.flags):
-        warn(line)
+        common.warn(line)
     return int(any(result.flags for result in results))

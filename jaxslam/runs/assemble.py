@@ -10,6 +10,7 @@ import numpy as np
 from jaxslam.filter import map_estimate, sharding
 from jaxslam.filter import step as fastslam
 from jaxslam.logs.odometry import dead_reckoning
+from jaxslam.results.events import association_entropy
 from jaxslam.results.result import MapEstimate, Result
 from jaxslam.smoother.genealogy import Ancestral, Lineage, Tree, smooth_ancestral, trace_lineage
 from jaxslam.smoother.rejuvenation import SharedPast
@@ -36,13 +37,10 @@ class Summary(NamedTuple):
     survivor: jax.Array
 
 
-# Fields that `Summary` and `Result` take from `step.Info` as they are; there, `pose` and
-# `landmark_id` are those of all particles. A new diagnostic is a field of each of the three.
-COPIED = tuple(
-    name
-    for name in Summary._fields
-    if name in fastslam.Info._fields and name not in ("pose", "landmark_id")
-)
+OF_ALL = "pose", "landmark_id"  # fields of `step.Info` that are those of all particles
+# Fields that `Summary` and `Result` take from `step.Info` as they are: a new diagnostic is a field
+# of each of the three.
+COPIED = tuple(f for f in Summary._fields if f in fastslam.Info._fields and f not in OF_ALL)
 COUNTS = "overflow", "outliers", "forgotten"  # over all particles; in `Result` the mean
 
 
@@ -69,6 +67,13 @@ class RunProgress(NamedTuple):
     seconds: float
     shared_past: SharedPast | None
     entropy: list
+
+    def add_chunk(self, summary, history):
+        """Append a chunk's `Summary` and `ParticleHistory` to the lists and the genealogy."""
+        self.summaries.append(summary)
+        self.entropy.append(association_entropy(history.landmark_id, history.ancestors))
+        if self.tree is not None:
+            self.tree.extend(*history)
 
 
 def local_origin(log):

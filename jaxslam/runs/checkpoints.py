@@ -123,9 +123,7 @@ class Checkpoints:
                 self.report(f"warning: skipping a broken checkpoint: {error}")
                 continue
             if differing := find_differences(before, self._run):
-                raise ValueError(
-                    f"{self.folder}: the checkpoint is of another run; differing: {differing}"
-                )
+                raise ValueError(f"{self.folder}: holds another run; differing: {differing}")
             if not self._readable and versions != run_folder.versions():
                 self.report("note: other versions wrote this checkpoint; last digits may differ")
             self._readable.append(path)

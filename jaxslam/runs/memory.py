@@ -1,4 +1,4 @@
-"""Whether a run fits into memory: asked before any large array is made."""
+"""Check that a run fits into memory before any large array is made."""
 
 import ctypes
 import math
@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import jax
 
-GROUPS = Path("/sys/fs/cgroup")
+CGROUPS = Path("/sys/fs/cgroup")
 
 
 class Memory(NamedTuple):
-    """Bytes a run needs: its `state`, what a `chunk` of steps hands over, at most the `genealogy`,
-    and the compiler's own `temporaries` (0 before it is compiled)."""
+    """Bytes that a run needs: for the `state`, the records of a `chunk`, at most the `genealogy`,
+    and the compiler's `temporaries` (0 before compiling)."""
 
     state: int
     chunk: int
@@ -32,44 +32,44 @@ class Memory(NamedTuple):
 
 
 def bytes_of(tree):
-    """Bytes of all arrays, or shapes of arrays, in a tree; where devices share them, what lies in
-    the memory that `available` is about."""
+    """Count the bytes of all arrays, or shapes of arrays, in a tree; of arrays shared by several
+    devices, those in the memory of `available_bytes`."""
     return sum(_size(leaf) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
 def _size(leaf):
-    shared = leaf.sharding
-    if shared is None or shared.num_devices == 1:
+    shards = leaf.sharding
+    if shards is None or shards.num_devices == 1:
         return leaf.size
-    return math.prod(shared.shard_shape(leaf.shape)) * _together(shared.num_devices)
+    return math.prod(shards.shard_shape(leaf.shape)) * _devices_together(shards.num_devices)
 
 
-def _together(devices):
-    """How many of a run's devices share the memory that `available` is about."""
+def _devices_together(devices):
+    """Count those of a run's devices that share the memory of `available_bytes`."""
     return devices // jax.process_count() if jax.devices()[0].platform == "cpu" else 1
 
 
 def memory_of_compiled(compiled, memory, config):
-    """`memory` with the compiler's own figures of a chunk whose state is donated."""
-    told = compiled.memory_analysis()
-    if told is None:  # not every backend says
+    """Complete `memory` with the compiler's figures for a chunk, whose state is donated."""
+    figures = compiled.memory_analysis()
+    if figures is None:  # not every backend has them
         return memory
-    # The figures are of one device; what several hand over is put together on the host.
-    times = _together(config.devices)
-    handed = times * (told.output_size_in_bytes - told.alias_size_in_bytes)
-    inputs = times * told.argument_size_in_bytes - memory.state
-    whole = memory.chunk if config.devices > 1 else 0
-    temporaries = times * told.temp_size_in_bytes
-    return memory._replace(chunk=handed + max(inputs, 0) + whole, temporaries=temporaries)
+    # They are of one device; what several devices return is put together on the host.
+    times = _devices_together(config.devices)
+    outputs = times * (figures.output_size_in_bytes - figures.alias_size_in_bytes)
+    inputs = times * figures.argument_size_in_bytes - memory.state
+    on_host = memory.chunk if config.devices > 1 else 0
+    temporaries = times * figures.temp_size_in_bytes
+    return memory._replace(chunk=outputs + max(inputs, 0) + on_host, temporaries=temporaries)
 
 
 def check_memory(memory, config):
-    """Raise `ValueError` if this does not fit, with the number of particles that would."""
+    """Raise `ValueError`, with the number of particles that would fit, if `memory` is too much."""
     free = available_bytes()
     if free is None or memory.total <= free:
         return
     n, fixed = config.particles, memory.chunk + memory.genealogy
-    # The state and the temporaries grow with the particles, what else there is hardly does.
+    # State and temporaries grow with the number of particles, the rest hardly does.
     share = (free - fixed) / (memory.total - fixed) if free > fixed else free / memory.total
     most = int(0.95 * n * share)
     most -= most % 10 ** max(0, len(str(most)) - 2)
@@ -80,18 +80,18 @@ def check_memory(memory, config):
 
 
 def available_bytes():
-    """Bytes that can still be had on the first device here; None: not known."""
+    """Return the free bytes of this process's first device; None: unknown."""
     device = jax.local_devices()[0]
     if device.platform != "cpu":
-        told = device.memory_stats() or {}
-        limit = told.get("bytes_limit")
-        return None if limit is None else limit - told.get("bytes_in_use", 0)
-    found = [size for size in (_machine_bytes(), *_cgroup_bytes()) if size is not None]
-    return min(found, default=None)
+        stats = device.memory_stats() or {}
+        limit = stats.get("bytes_limit")
+        return None if limit is None else limit - stats.get("bytes_in_use", 0)
+    sizes = [size for size in (_machine_bytes(), *_cgroup_bytes()) if size is not None]
+    return min(sizes, default=None)
 
 
 def resident_bytes():
-    """Bytes of memory this process has now; None: not known."""
+    """Return the resident bytes of this process; None: unknown."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError):
@@ -99,17 +99,16 @@ def resident_bytes():
 
 
 def trim_heap():
-    """Hand memory that was freed back to the system: after compiling it is hundreds of megabytes,
-    which the C library would keep. Only glibc can; elsewhere nothing is done."""
+    """Return freed memory, hundreds of megabytes after compiling, to the system; glibc only."""
     with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def print_memory(memory):
-    """One line about the need, on stderr."""
+    """Print needed and free memory on stderr."""
     free = available_bytes()
-    said = "" if free is None else f"; {_gb(free)} are free"
-    print(f"note: memory needed: {memory}{said}", file=sys.stderr)
+    text = "" if free is None else f"; {_gb(free)} are free"
+    print(f"note: memory needed: {memory}{text}", file=sys.stderr)
 
 
 def _gb(size):
@@ -121,12 +120,12 @@ def _machine_bytes():
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:
         return None
-    told = next((line.split() for line in lines if line.startswith("MemAvailable:")), None)
-    return told and int(told[1]) * 1024
+    words = next((line.split() for line in lines if line.startswith("MemAvailable:")), None)
+    return words and int(words[1]) * 1024
 
 
-def _cgroup_bytes(groups=GROUPS, own=Path("/proc/self/cgroup")):
-    """What is left of the limits of this process's control groups, versions 1 and 2."""
+def _cgroup_bytes(groups=CGROUPS, own=Path("/proc/self/cgroup")):
+    """Yield the free bytes (None: no limit) of this process's control groups, versions 1 and 2."""
     try:
         lines = own.read_text().splitlines()
     except OSError:
@@ -139,15 +138,15 @@ def _cgroup_bytes(groups=GROUPS, own=Path("/proc/self/cgroup")):
         if kinds:
             names = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
         base = groups / "memory" if kinds else groups
-        place = base / path.strip("/")
+        group = base / path.strip("/")
         # In a container the path may be the host's: then the limit is at the base.
-        for folder in (place, *place.parents):
+        for folder in (group, *group.parents):
             if folder.is_relative_to(base):
-                yield _left(folder, *names)
+                yield _free_bytes(folder, *names)
 
 
-def _left(folder, limit, usage, cache):
-    """Bytes left in one group; file pages that can be dropped count as free. None: no limit."""
+def _free_bytes(folder, limit, usage, cache):
+    """Return the free bytes of one group, with cached file pages; None: no limit."""
     try:
         most = (folder / limit).read_text().strip()
         used = int((folder / usage).read_text())

@@ -17,16 +17,9 @@ from jaxslam.filter.frames import frames_from_log
 from jaxslam.logs.log import Log
 from jaxslam.parameter_file import validate
 from jaxslam.parameters import Params, default_params
-from jaxslam.results.events import association_entropy
 from jaxslam.results.result import Result
-from jaxslam.runs import compiled, memory
-from jaxslam.runs.assemble import (
-    RunProgress,
-    assemble_result,
-    local_origin,
-    logged_identity,
-    settle_donated,
-)
+from jaxslam.runs import assemble, compiled, memory
+from jaxslam.runs.assemble import RunProgress
 from jaxslam.smoother.genealogy import Tree, trace_lineage
 from jaxslam.smoother.rejuvenation import Rejuvenator
 
@@ -86,8 +79,9 @@ def run(
         so_far = checkpoints.restore(compiled.state_shapes(config))
     filter_chunk, compile_seconds = None, 0.0
     if so_far is None or so_far.done < len(data.time):
-        begin = time.perf_counter()
-        filter_chunk = _compile(data, config, params)
+        begin, chunks = time.perf_counter(), compiled.split_into_chunks(data, config)
+        numbers = jax.tree.map(jnp.asarray, params)
+        filter_chunk = compiled.compile_loop(config, next(chunks)[1], numbers)
         compile_seconds = time.perf_counter() - begin
         _check_compiled(filter_chunk, len(data.time), config, so_far, checkpoints)
     if checkpoints:
@@ -97,24 +91,17 @@ def run(
     if so_far is None:
         tree = Tree() if sharding.is_leader() else None
         so_far = RunProgress(initial_state(log, config, key), [], tree, 0, 0.0, None, [])
-    rejuvenator = Rejuvenator(data, log, local_origin(log), params, config)
+    rejuvenator = Rejuvenator(data, log, assemble.local_origin(log), params, config)
     so_far = _filter(
         filter_chunk, key, so_far, data, params, config, rejuvenator, progress, checkpoints
     )
-    result = assemble_result(so_far, log, config, params, seed, data, compile_seconds)
+    result = assemble.assemble_result(so_far, log, config, params, seed, data, compile_seconds)
     return refine_result(result) if refine else result
-
-
-def _compile(data, config, params):
-    """Compile the loop over a chunk of the frames."""
-    _, chunk = next(iter(compiled.split_into_chunks(data, config)))
-    filter_chunk = compiled.compile_loop(config, chunk, jax.tree.map(jnp.asarray, params))
-    memory.trim_heap()
-    return filter_chunk
 
 
 def _check_compiled(filter_chunk, frames, config, so_far, checkpoints):
     """Print the memory that a large run needs; raise `ValueError` if a new run does not fit."""
+    memory.trim_heap()
     need = memory.memory_of_compiled(filter_chunk, compiled.estimate_memory(config, frames), config)
     if sharding.is_leader() and (checkpoints or need.total > 1e9):
         memory.print_memory(need)
@@ -124,7 +111,7 @@ def _check_compiled(filter_chunk, frames, config, so_far, checkpoints):
 
 def initial_state(log, config, key):
     """Make the `State` before a log's first frame."""
-    return fastslam.init(config, key, log.start_pose - local_origin(log), log.start_cov)
+    return fastslam.init(config, key, log.start_pose - assemble.local_origin(log), log.start_cov)
 
 
 def refine_result(result, progress=None):
@@ -147,7 +134,8 @@ def refine_result(result, progress=None):
             config.sensor, known=config.association == "known",
             progress=progress and (lambda done, _: progress(done, None)),
         )  # fmt: skip
-        refined = refined._replace(identity=logged_identity(refined.identity, data.identities))
+        identity = assemble.logged_identity(refined.identity, data.identities)
+        refined = refined._replace(identity=identity)
     except (MemoryError, np.linalg.LinAlgError):  # keep what was filtered
         refined = result.refined
     return dataclasses.replace(result, refined=refined, refine_seconds=time.perf_counter() - begin)
@@ -190,7 +178,12 @@ def _rejuvenate(rejuvenator, key, so_far, config):
     best = int(last.survivor[-1])
     lineage = trace_lineage(so_far.tree, best) if so_far.tree is not None else None
     state, shared_past, lost = rejuvenator.rejuvenate(
-        key, settle_donated(so_far.state, config), so_far.shared_past, lineage, so_far.done, best
+        key,
+        assemble.settle_donated(so_far.state, config),
+        so_far.shared_past,
+        lineage,
+        so_far.done,
+        best,
     )
     so_far = so_far._replace(state=state, shared_past=shared_past)
     if lost is None:
@@ -207,11 +200,7 @@ def _run_chunk(filter_chunk, arguments, so_far, count):
     """Filter a chunk, append its `count` steps to `so_far`, and return the state after it."""
     state, kept = filter_chunk(*arguments)
     # The last chunk is padded.
-    summary, history = jax.tree.map(lambda leaf: sharding.to_host(leaf)[:count], kept)
-    so_far.summaries.append(summary)
-    so_far.entropy.append(association_entropy(history.landmark_id, history.ancestors))
-    if so_far.tree is not None:
-        so_far.tree.extend(*history)
+    so_far.add_chunk(*jax.tree.map(lambda leaf: sharding.to_host(leaf)[:count], kept))
     return state
 
 

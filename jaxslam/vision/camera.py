@@ -7,9 +7,8 @@ atan2(y, x), counter-clockwise from ahead, and elevation asin(z).
 
 Lengths are normalised by s = half the longer side. `polynomial` is the model of Scaramuzza,
 Martinelli and Siegwart (2006): ray ~ (x, y, a0 + a2 rho^2 + a3 rho^3 ...), with a symmetric affine
-map of the image and two decentring terms for a mirror that is not aligned with the lens; `unified`
-is the sphere model of Mei and Rives (2007) with radial and tangential distortion, as in OpenCV's
-omnidir and Kalibr's omni-radtan.
+map of the image and two decentring terms for a misaligned mirror; `unified` is the sphere model of
+Mei and Rives (2007) with radial and tangential distortion (OpenCV's omnidir, Kalibr's omni-radtan).
 """
 
 import math
@@ -27,8 +26,7 @@ NEWTON = 6  # steps; four reach double precision from the table's value
 
 def parameter_names(model, count=None):
     """Names of the first `count` parameters of a model (None: all); a polynomial may end early."""
-    names = {"polynomial": POLYNOMIAL, "unified": UNIFIED}[model]
-    return names[:count]
+    return {"polynomial": POLYNOMIAL, "unified": UNIFIED}[model][:count]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +34,9 @@ class Camera:
     """A calibrated camera. Raises `ValueError` for invalid values.
 
     `params` [P], named by `parameter_names(model)`: cx, cy, fx, fy, s in px, others without unit;
-    `covariance` [P, P] of them or None. `mirror`: a single mirror, which reverses z. `lens`: where
-    the lens points on the robot, "up" or "down". `yaw`, `roll`, `pitch` [rad] turn the camera about
-    the robot's z, x and y, in this order; `position` (x, y, height) [m] on the robot. `elevation`
-    (low, high) [rad]: usable part of the view.
+    `covariance` [P, P] of them or None. `mirror`: a single mirror, which reverses z. `lens` points
+    "up" or "down". `yaw`, `roll`, `pitch` [rad] turn the camera about the robot's z, x and y, in
+    this order; `position` (x, y, height) [m] on it. `elevation` (low, high) [rad]: usable view.
     """
 
     width: int
@@ -75,9 +72,7 @@ class Camera:
         _set(self, "elevation", _tuple("elevation", self.elevation, 2))
         low, high = self.elevation
         if not -math.pi / 2 <= low < high <= math.pi / 2:
-            raise ValueError(
-                f"camera: elevation {low:g}..{high:g} rad; must rise within -pi/2..pi/2"
-            )
+            raise ValueError(f"camera: elevation {low:g}..{high:g} rad; must rise within +-pi/2")
         if self.covariance is not None:
             _set(self, "covariance", _numbers("covariance", self.covariance, 2))
             if self.covariance.shape != (count, count):
@@ -102,8 +97,8 @@ class Camera:
     @property
     def matrix(self) -> np.ndarray:
         """Matrix [3, 3] from the model frame to the robot's frame (improper for a mirror)."""
-        back = -1.0 if self.mirror else 1.0
-        base = np.diag([1.0, 1.0, back]) if self.lens == "up" else np.diag([1.0, -1.0, -back])
+        side, back = 1.0 if self.lens == "up" else -1.0, -1.0 if self.mirror else 1.0
+        base = np.diag([1.0, side, side * back])
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
         return tilt_matrix(self.roll, self.pitch) @ turn @ base
@@ -129,8 +124,7 @@ class Camera:
 
     def _inside(self, pixel):
         with np.errstate(invalid="ignore"):
-            above = (pixel >= -0.5).all(-1)
-            return above & (pixel <= np.array(self.size) - 0.5).all(-1)
+            return ((pixel >= -0.5) & (pixel <= np.array(self.size) - 0.5)).all(-1)
 
 
 def tilt_matrix(roll, pitch):
@@ -190,8 +184,7 @@ def ray_to_pixel(model, params, size, ray):
         x, y, _ = _distort(x / lateral * rho, y / lateral * rho, (0.0, 0.0, p1, p2))
         x, y = half * x, half * y
         u, v = params[0] + x + e * y, params[1] + d * x + c * y
-    pixel = xp.stack([u, v], -1)
-    return xp.where(imaged[..., None], pixel, xp.nan)
+    return xp.where(imaged[..., None], xp.stack([u, v], -1), xp.nan)
 
 
 def _radius(xp, stop, a, lateral, z):

@@ -10,15 +10,8 @@ from dataclasses import fields
 from pathlib import Path
 
 from jaxslam.files import atomic_write
+from jaxslam.vision import foreign_camera_formats as foreign
 from jaxslam.vision.camera import MODELS, Camera, parameter_names
-from jaxslam.vision.foreign_camera_formats import (
-    from_kalibr,
-    from_ocamcalib,
-    from_opencv,
-    to_kalibr,
-    to_ocamcalib,
-    to_opencv,
-)
 
 MAX_BYTES = 1 << 20
 FORMATS = ("toml", "ocamcalib", "kalibr", "opencv")
@@ -35,9 +28,9 @@ def save_camera(path: str | Path, camera: Camera, kind: str | None = None) -> No
     kind = kind or BY_SUFFIX.get(path.suffix.lower())
     if kind not in FORMATS:
         raise ValueError(f"{path}: {ENDINGS}")
-    writers = dict(zip(FORMATS, (_to_toml, to_ocamcalib, to_kalibr, to_opencv), strict=True))
+    writers = _to_toml, foreign.to_ocamcalib, foreign.to_kalibr, foreign.to_opencv
     try:
-        text = writers[kind](camera)
+        text = writers[FORMATS.index(kind)](camera)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     with atomic_write(path) as file:
@@ -58,9 +51,9 @@ def load_camera(path: str | Path, mirror: bool = False, lens: str = "up") -> Cam
         if kind == "toml":
             return _from_toml(text)
         if kind == "ocamcalib":
-            model = from_ocamcalib(text)
+            model = foreign.from_ocamcalib(text)
         else:
-            model = (from_opencv if text.startswith("%YAML") else from_kalibr)(text)
+            model = (foreign.from_opencv if text.startswith("%YAML") else foreign.from_kalibr)(text)
         return Camera(**model, mirror=mirror, lens=lens)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
@@ -92,8 +85,8 @@ def _to_toml(camera):
     lines += [f"{name} = {value!r}" for name, value in zip(camera.names, values, strict=True)]
     if camera.covariance is not None:
         lines += ["", "[covariance]  # of the params, in their order"]
-        rows = zip(camera.names, camera.covariance.tolist(), strict=True)
-        lines += [f"{name} = {row}" for name, row in rows]
+        rows = camera.covariance.tolist()
+        lines += [f"{name} = {row}" for name, row in zip(camera.names, rows, strict=True)]
     return "\n".join(lines) + "\n"
 
 

@@ -22,9 +22,8 @@ SOFT = 2.0  # pixels from a sharp edge at which its gradient has faded
 class Fit(NamedTuple):
     """Of n segments: `column` (NaN: no peak), its standard deviation `scatter`, and `width`
     (standard deviation of the gradient's profile), in columns of the padded panorama; `slope`
-    [columns per row]; `sign` of the gradient to the right; `strength`, root of the sum of squares
-    of the gradient over the `rows`; `sharp`, 1 - gradient beside / at the edge; `first`, `last`
-    row."""
+    [columns per row]; `sign` of the gradient to the right; `strength`, its root sum of squares over
+    the `rows`; `sharp`, 1 - gradient beside / at the edge; `first` and `last` row."""
 
     column: np.ndarray
     scatter: np.ndarray
@@ -57,23 +56,17 @@ def fit_segments(edges, columns_per_pixel):
     across = gradient(edges.gradient, centre[:, None] + np.arange(-REACH, REACH + 1))
     size = np.bincount(segment, np.abs(along), n)
     first, last = _ends(edges, np.abs(along) >= FADED * mean(np.abs(along), segment, n)[segment], n)
-    start, block = np.unique(
-        segment * len(edges.along) + edges.row // BLOCK, return_index=True, return_inverse=True
-    )[1:]
+    blocks = segment * len(edges.along) + edges.row // BLOCK
+    start, block = np.unique(blocks, return_index=True, return_inverse=True)[1:]
     profile = np.stack([np.bincount(block, part) for part in across.T], -1)
     peak, scatter, width = _peak(profile, segment[start], n)
     return Fit(
-        column=centre[np.searchsorted(segment, np.arange(n))] + peak,
-        scatter=scatter,
-        width=width,
-        slope=_slope(edges, n),
-        sign=np.where(np.bincount(segment, along, n) >= 0, 1, -1),
+        column=centre[np.searchsorted(segment, np.arange(n))] + peak, scatter=scatter, width=width,
+        slope=_slope(edges, n), sign=np.where(np.bincount(segment, along, n) >= 0, 1, -1),
         strength=np.sqrt(np.bincount(segment, along**2, n)),
-        rows=np.bincount(segment, minlength=n),
+        rows=np.bincount(segment, minlength=n), first=first, last=last,
         sharp=1 - np.bincount(segment, beside, n) / np.maximum(size, 1e-9),
-        first=first,
-        last=last,
-    )
+    )  # fmt: skip
 
 
 def mean(value, owner, n):
@@ -113,8 +106,7 @@ def _peak(profile, owner, n):
     left, middle, right = (profile[np.arange(len(owner)), top[owner] + k] for k in (-1, 0, 1))
     curvature = np.clip(2 * middle - left - right, 0, None)
     peak = np.clip((right - left) / 2 / np.maximum(curvature, 1e-6), -1.5, 1.5)
-    average = np.maximum(mean(curvature, owner, n), 1e-9)
-    share = curvature / average[owner]
+    share = curvature / np.maximum(mean(curvature, owner, n), 1e-9)[owner]
     weight = share
     for _ in range(3):
         total = np.maximum(np.bincount(owner, weight, n), 1e-9)
@@ -124,11 +116,9 @@ def _peak(profile, owner, n):
         variance = square / (np.maximum(np.bincount(owner, minlength=n) - 1, 0) + PRIOR)
         ratio = deviation * np.sqrt(share / variance[owner])
         weight = share * CLIP / np.maximum(ratio, CLIP)
-    is_peak = (
-        summed[np.arange(n), top] * 2
-        > summed[np.arange(n), top - 1] + summed[np.arange(n), top + 1]
-    )
-    left, middle, right = (np.maximum(summed[np.arange(n), top + k], 1e-9) for k in (-1, 0, 1))
+    left, middle, right = (summed[np.arange(n), top + k] for k in (-1, 0, 1))
+    is_peak = middle * 2 > left + right
+    left, middle, right = (np.maximum(part, 1e-9) for part in (left, middle, right))
     log_curvature = np.maximum(2 * np.log(middle) - np.log(left) - np.log(right), 0.05)
     column = np.where(is_peak, top - REACH + offset, np.nan)
     return column, np.sqrt(variance / total), np.sqrt(1 / log_curvature)

@@ -32,46 +32,41 @@ def find_edges(panorama_image, valid, contrast, significance, length, gap, slope
     """Find the `Edges` of a panorama uint8 [H, W, C] where the mask `valid` [H, W] is set.
 
     Least `contrast` [grey levels per column] and `significance` [in units of the row's noise] of a
-    peak; least `length` and largest `gap` [rows] of a segment, and its largest `slope` [columns per
-    row].
+    peak; least `length`, largest `gap` [rows] and `slope` [columns per row] of a segment.
     """
-    padded = np.concatenate(
-        [panorama_image[:, -PAD:], panorama_image, panorama_image[:, :PAD]], axis=1
-    )
+    padded = _pad(panorama_image)
     channels = panorama_image[0, 0].size  # grey levels are RMS over the channels
     gradient = cv2.Sobel(padded, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8 / np.sqrt(channels))
     along = cv2.blur(gradient, (1, SMOOTH_ROWS), borderType=cv2.BORDER_REPLICATE)
-    gradient = gradient.reshape(*padded.shape[:2], -1)
-    along = along.reshape(gradient.shape)
+    gradient, along = (part.reshape(*padded.shape[:2], -1) for part in (gradient, along))
     magnitude = np.sqrt(np.einsum("hwc,hwc->hw", along, along))
     magnitude[~_erode_mask(valid)] = 0
-    noise = _noise(magnitude)
+    # Few columns are edges, so a row's median is its noise.
+    noise = np.median(magnitude[:, PAD:-PAD:NOISE_STRIDE], axis=1)
     threshold = np.maximum(contrast, significance * noise)
     peak = _peaks(magnitude, threshold[:, None].astype(np.float32))
     row, column, segment = _segments(peak, length, gap, slope)
     return Edges(segment, row, _interpolate_columns(magnitude, row, column), gradient, along)
 
 
+def _pad(image):
+    """The panorama [H, W, ...] with `PAD` columns repeated on either side."""
+    return np.concatenate([image[:, -PAD:], image, image[:, :PAD]], axis=1)
+
+
 def _erode_mask(valid):
     """The padded mask without the pixels that the filters mix with the border of the image."""
-    padded = np.concatenate([valid[:, -PAD:], valid, valid[:, :PAD]], axis=1).astype(np.uint8)
+    padded = _pad(valid).astype(np.uint8)
     if padded.all():
         return padded > 0
     return cv2.erode(padded, np.ones((SMOOTH_ROWS, 5), np.uint8)) > 0
 
 
-def _noise(magnitude):
-    """Noise [H] of the gradient in each row: its median, since few columns are edges."""
-    return np.median(magnitude[:, PAD:-PAD:NOISE_STRIDE], axis=1)
-
-
 def _peaks(magnitude, threshold):
     """Mask uint8 [H, W] of the pixels above the threshold and above both neighbours in the row."""
     peak = np.zeros(magnitude.shape, np.uint8)
-    middle = magnitude[:, 1:-1]
-    peak[:, 1:-1] = (
-        (middle > threshold) & (middle >= magnitude[:, :-2]) & (middle > magnitude[:, 2:])
-    )
+    left, middle, right = magnitude[:, :-2], magnitude[:, 1:-1], magnitude[:, 2:]
+    peak[:, 1:-1] = (middle > threshold) & (middle >= left) & (middle > right)
     return peak
 
 

@@ -55,16 +55,15 @@ def extract(
     colours left and right as blue, green, red), and a point [m] where its parallax suffices.
 
     Every readable image is a frame, even without a line. `bearing_sigma` is the standard deviation
-    of a line's fit. The filter's `sigma_bearing` stays as it is: it has to be larger, since errors
-    of edges that have a width repeat from frame to frame. Images and measurements left out are
-    counted by reason in `skipped`. Raises `ValueError` if no image can be used, or if the settings
-    differ from those of the interrupted run to be resumed.
+    of a line's fit; the filter's `sigma_bearing` has to be larger, since errors of edges that have
+    a width repeat from frame to frame. What is left out is counted by reason in `skipped`. Raises
+    `ValueError` if no image can be used, or for other settings than those of the run to resume.
     """
+    out = None if out is None else Path(out)
     _check_out(out, overwrite)
-    journal_path = None if out is None else Path(out).with_name(f".{Path(out).name}.partial")
-    skipped = {}
+    journal_path = None if out is None else out.with_name(f".{out.name}.partial")
+    skipped, images = {}, Images(source)
     lines = LineSettings() if lines is None else lines
-    images = Images(source)
     resumes = journal_path is not None and journal_path.exists()
     _check_overlay(overlay, images, overwrite or resumes)
     kind, table = read_odometry(odometry, skipped)
@@ -72,16 +71,16 @@ def extract(
     kept = _select_images(images, time, kind, table.time, skipped)
     if len(kept) == 0:
         spans = f"{_format_span(time[time != NO_TIME])}; {odometry} has {_format_span(table.time)}"
-        raise ValueError(
-            f"{images.names[0]}: no image has odometry; times are from {origin}, {spans}"
-        )
+        why = f"no image has odometry; times are from {origin}, {spans}"
+        raise ValueError(f"{images.names[0]}: {why}")
     known = _read_truth_folder(truth, skipped)
     settings = _fingerprint(images, time, kept, camera, lines)
     with ExtractionJournal(journal_path, settings) as journal:
         _extract_images(images, kept, camera, lines, journal, overlay, progress)
     if all(isinstance(lines, str) for _, lines in journal.images):
         journal.remove()  # there is nothing in it to resume from
-    name = _log_name(source, out)
+    first = source if isinstance(source, str | Path) else source[0]
+    name = (out or Path(first)).stem or "images"
     log = _make_log(journal.images, time[kept], kind, table, camera, reach, skipped, name)
     log = _add_truth(log, *known)
     if params is not None:  # the filter must use the motion model that the points were made with
@@ -96,12 +95,9 @@ def extract(
 
 
 def _check_out(out, overwrite):
-    if out is None:
-        return
-    out = Path(out)
-    if out.suffix != ".npz":
+    if out is not None and out.suffix != ".npz":
         raise ValueError(f"{out}: a log is a .npz file; name it {out.name}.npz")
-    if out.exists() and not overwrite:
+    if out is not None and out.exists() and not overwrite:
         raise ValueError(f"{out}: exists; choose another name, or overwrite it")
 
 
@@ -112,9 +108,8 @@ def _check_overlay(target, images, replace):
     target = Path(target)
     sources = [images.video] if images.video else {Path(file).parent for file in images.files}
     if any(target.resolve() == source.resolve() for source in sources):
-        raise ValueError(
-            f"{target}: the images themselves are there; choose another place for drawings"
-        )
+        why = "the images themselves are there; choose another place for drawings"
+        raise ValueError(f"{target}: {why}")
     exists = any(target.iterdir()) if target.is_dir() else target.exists()
     if exists and not replace:
         raise ValueError(f"{target}: exists; choose another name or add --overwrite")
@@ -122,13 +117,6 @@ def _check_overlay(target, images, replace):
 
 def _format_span(stamps):
     return f"{stamps.min() / 1e9:.1f} to {stamps.max() / 1e9:.1f} s"
-
-
-def _log_name(source, out):
-    if out is not None:
-        return Path(out).stem
-    first = source[0] if isinstance(source, list | tuple) else source
-    return Path(first).stem or "images"
 
 
 def _select_images(images, time, kind, odometry_time, skipped):
@@ -150,8 +138,8 @@ def _select_images(images, time, kind, odometry_time, skipped):
         inside = time[order] >= odometry_time[0] - margin
         inside &= time[order] <= odometry_time[-1] + margin
     else:
-        # A command acts at its stamp: before the first and after the last one the robot stands.
-        # An image from long before or after belongs to another drive.
+        # Before the first and after the last command the robot stands, but an image from long
+        # before or after belongs to another drive.
         margin = max(60e9, float(odometry_time[-1] - odometry_time[0]))
         inside = np.abs(time[order] - np.clip(time[order], *odometry_time[[0, -1]])) <= margin
     _count(skipped, "image without odometry at its time", int((~inside).sum()))
@@ -222,11 +210,9 @@ def _extract_image(image, camera, settings):
 
 def _make_log(images, time, kind, odometry, camera, reach, skipped, name):
     """The `Log` of bearings alone, without truth or points."""
-    reasons = Counter(lines for _, lines in images if isinstance(lines, str))
-    first = {}
-    for image, lines in images:
-        if isinstance(lines, str):
-            first.setdefault(lines, image)
+    unusable = [(image, why) for image, why in images if isinstance(why, str)]
+    reasons = Counter(why for _, why in unusable)
+    first = {why: image for image, why in reversed(unusable)}
     skipped |= {f"{why} (first: {first[why]})": count for why, count in reasons.items()}
     usable = [k for k, (_, lines) in enumerate(images) if not isinstance(lines, str)]
     if not usable:
@@ -238,20 +224,13 @@ def _make_log(images, time, kind, odometry, camera, reach, skipped, name):
     lines = Lines(*(np.concatenate(parts) for parts in zip(*frames, strict=True)))
     colour = lines.colour.reshape(-1, 6)
     return Log(
-        name=name,
-        odometry_time=odometry.time,
-        odometry=odometry.value,
-        odometry_kind=kind,
-        frame_time=time[usable],
-        frame=np.repeat(np.arange(len(usable)), counts),
-        bearing=lines.bearing,
-        bearing_sigma=lines.sigma,
-        descriptor=np.column_stack([lines.low, lines.high, lines.polarity, colour]),
-        view=(-np.pi, np.pi, reach),
+        name=name, skipped=skipped, noise={"detection": DETECTION}, view=(-np.pi, np.pi, reach),
         mounting=(*camera.position[:2], 0.0),  # bearings are relative to the robot's heading
-        noise={"detection": DETECTION},
-        skipped=skipped,
-    )
+        odometry_time=odometry.time, odometry=odometry.value, odometry_kind=kind,
+        frame_time=time[usable], frame=np.repeat(np.arange(len(usable)), counts),
+        bearing=lines.bearing, bearing_sigma=lines.sigma,
+        descriptor=np.column_stack([lines.low, lines.high, lines.polarity, colour]),
+    )  # fmt: skip
 
 
 def _read_truth_folder(folder, skipped):
@@ -269,11 +248,10 @@ def _read_truth_folder(folder, skipped):
 
 def _add_truth(log, truth, plan):
     """The log with its truth, started at the true pose if that is known."""
-    motion = increments(log)
-    still = (motion.distance[1:] == 0) & (motion.turn[1:] == 0)
-    skipped = dict(log.skipped)
-    _count(skipped, f"{NOT_USED}image without motion since the one before (a frame all the same)",
-           still.sum())  # fmt: skip
+    motion, skipped = increments(log), dict(log.skipped)
+    still = ((motion.distance[1:] == 0) & (motion.turn[1:] == 0)).sum()
+    why = f"{NOT_USED}image without motion since the one before (a frame all the same)"
+    _count(skipped, why, still)
     start = None
     if truth is not None and truth.time is not None:
         start = pose_at(max(log.start, int(truth.time[0])), truth.time, truth.pose)
@@ -303,9 +281,8 @@ class _Overlay:
             try:
                 self.target.mkdir(parents=True, exist_ok=True)
             except OSError as err:
-                raise ValueError(
-                    f"{self.target}: can't be made ({err.strerror}); give a folder, .mp4 or .avi"
-                ) from None
+                why = f"can't be made ({err.strerror}); give a folder, .mp4 or .avi"
+                raise ValueError(f"{self.target}: {why}") from None
         return self
 
     def __exit__(self, *_):

@@ -58,16 +58,12 @@ class ExtractionJournal:
             settings = json.loads(lines[0])
             images = [_decode(json.loads(line)) for line in lines[1:]]
         except (ValueError, KeyError, TypeError) as err:
-            raise ValueError(
-                f"{self.path}: is damaged ({err}); delete it to start afresh"
-            ) from None
+            raise ValueError(f"{self.path}: is damaged ({err}); delete it to restart") from None
         if settings != self.settings:
             both = set(settings) | set(self.settings)
             changed = sorted(k for k in both if settings.get(k) != self.settings.get(k))
-            raise ValueError(
-                f"{self.path}: was started with other settings ({', '.join(changed)}); use those "
-                "again, or delete it to start afresh"
-            )
+            fault = f"was started with other settings ({', '.join(changed)})"
+            raise ValueError(f"{self.path}: {fault}; use those again, or delete it to restart")
         self.images = images
         return sum(map(len, lines))
 
@@ -98,7 +94,6 @@ def _encode(name, lines):
         return {"image": name, "skipped": lines}
     parts = {}
     for field, array in zip(Lines._fields, lines, strict=True):
-        array = np.ascontiguousarray(array)
         data = base64.b64encode(array.tobytes()).decode()
         parts[field] = [array.dtype.str, list(array.shape), data]
     return {"image": name, "lines": parts}

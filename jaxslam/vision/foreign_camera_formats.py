@@ -22,6 +22,8 @@ OCAM = (
     'image size: "height" and "width"',
 )
 OCAM_NAMES = ("direct polynomial", "inverse polynomial", "center", "affine", "image size")
+OPENCV = {"camera_matrix": 9, "distortion_coefficients": 4, "xi": 1}  # name: count of numbers
+OPENCV |= {"image_width": 1, "image_height": 1}
 INVERSE_ERROR, INVERSE_DEGREE = 0.01, 25  # largest error [px] and degree
 
 
@@ -52,27 +54,18 @@ def from_ocamcalib(text):
 def to_ocamcalib(camera):
     """Text of a calib_results.txt. Raises `ValueError` if the format can't hold the camera."""
     if camera.model != "polynomial" or camera["p1"] or camera["p2"]:
-        raise ValueError(
-            "OCamCalib's file holds a polynomial camera without decentring (p1, p2) only;"
-            " calibrate with simple=True"
-        )
+        limit = "without decentring (p1, p2) only; calibrate with simple=True"
+        raise ValueError(f"OCamCalib's file holds a polynomial camera {limit}")
     half, a = max(camera.size) / 2, camera.params[7:]
     powers = np.array([0, *range(2, len(a) + 1)])
     direct = np.zeros(powers[-1] + 1)
     direct[powers] = -a * half ** (1.0 - powers)
     inverse = _inverse(direct, FARTHEST * half)
-    numbers = (
-        [len(direct), *direct],
-        [len(inverse), *inverse],
-        [camera["cy"], camera["cx"]],
-        [camera[name] for name in "cde"],
-        [camera.height, camera.width],
-    )
-    lines = [
-        f"#{title}\n\n{_format_numbers(values)}\n"
-        for title, values in zip(OCAM, numbers, strict=True)
-    ]
-    return "\n".join(lines)
+    polynomials = [len(direct), *direct], [len(inverse), *inverse]
+    centre, affine = (camera["cy"], camera["cx"]), [camera[name] for name in "cde"]
+    numbers = *polynomials, centre, affine, (camera.height, camera.width)
+    parts = zip(OCAM, map(_format_numbers, numbers), strict=True)
+    return "\n".join(f"#{title}\n\n{text}\n" for title, text in parts)
 
 
 def _inverse(direct, farthest):
@@ -122,18 +115,14 @@ def to_kalibr(camera):
         raise ValueError(
             "Kalibr's omni holds a unified camera without skew (s) only; calibrate with simple=True"
         )
-    return yaml.safe_dump(
-        {
-            "cam0": {
-                "camera_model": "omni",
-                "intrinsics": [camera[name] for name in ("xi", "fx", "fy", "cx", "cy")],
-                "distortion_model": "radtan",
-                "distortion_coeffs": [camera[name] for name in ("k1", "k2", "p1", "p2")],
-                "resolution": [camera.width, camera.height],
-            }
-        },
-        sort_keys=False,
-    )
+    fields = {
+        "camera_model": "omni",
+        "intrinsics": [camera[name] for name in ("xi", "fx", "fy", "cx", "cy")],
+        "distortion_model": "radtan",
+        "distortion_coeffs": [camera[name] for name in ("k1", "k2", "p1", "p2")],
+        "resolution": [camera.width, camera.height],
+    }
+    return yaml.safe_dump({"cam0": fields}, sort_keys=False)
 
 
 def from_opencv(text):
@@ -141,15 +130,11 @@ def from_opencv(text):
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         found = {}
-        for name, count in (
-            ("camera_matrix", 9), ("distortion_coefficients", 4), ("xi", 1),
-            ("image_width", 1), ("image_height", 1),
-        ):  # fmt: skip
+        for name, count in OPENCV.items():
             node = storage.getNode(name)
             if node.empty():
                 raise ValueError(f"{name} is missing")
-            value = node.mat() if node.isMap() else node.real()
-            found[name] = _floats(name, np.ravel(value))
+            found[name] = _floats(name, np.ravel(node.mat() if node.isMap() else node.real()))
             if len(found[name]) != count:
                 raise ValueError(f"{name} has {len(found[name])} numbers; must be {count}")
     except cv2.error as error:
@@ -157,9 +142,8 @@ def from_opencv(text):
     fx, s, cx, _, fy, cy = found["camera_matrix"][:6]
     if not np.array_equal(found["camera_matrix"][[3, 6, 7, 8]], [0, 0, 0, 1]):
         raise ValueError("camera_matrix must be [fx, s, cx; 0, fy, cy; 0, 0, 1]")
-    width, height = (
-        _positive_integer(name, found[name][0]) for name in ("image_width", "image_height")
-    )
+    size = ("image_width", "image_height")
+    width, height = (_positive_integer(name, found[name][0]) for name in size)
     params = [cx, cy, fx, fy, s, found["xi"][0], *found["distortion_coefficients"]]
     return dict(width=width, height=height, model="unified", params=params)
 

@@ -16,8 +16,7 @@ def image_times(images, odometry, table=None):
 
     The first source that applies: `table`, or a `frames.csv` (image,time_s) in the images' folder
     or the one above; commands, if there is one image before the first and one after each; a video's
-    frame rate; names that are numbers, in seconds. `odometry` is (kind, stamps [o] ns). Raises
-    `ValueError` saying what to provide.
+    frame rate; names in seconds. `odometry`: (kind, stamps [o] ns). Raises `ValueError` if none do.
     """
     table = _find_table(images) if table is None else Path(table)
     if table is not None:

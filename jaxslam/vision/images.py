@@ -70,11 +70,8 @@ def read_image(path):
     if image is None:
         raise ValueError(f"{path}: can't be decoded: truncated or damaged")
     if image.shape[:2] != (header.height, header.width):
-        announced, size = (
-            f"{header.width} x {header.height}",
-            f"{image.shape[1]} x {image.shape[0]}",
-        )
-        raise ValueError(f"{path}: announces {announced} pixels but holds {size}")
+        announced, (height, width) = f"{header.width} x {header.height}", image.shape[:2]
+        raise ValueError(f"{path}: announces {announced} pixels but holds {width} x {height}")
     return image
 
 
@@ -129,10 +126,8 @@ def check_size(image, camera, name):
     """Raise `ValueError` unless the camera is calibrated for an image [H, W, ...] of this size."""
     height, width = image.shape[:2]
     if (width, height) != (camera.width, camera.height):
-        raise ValueError(
-            f"{name}: {width} x {height} pixels; the camera is calibrated for "
-            f"{camera.width} x {camera.height}"
-        )
+        calibrated = f"the camera is calibrated for {camera.width} x {camera.height}"
+        raise ValueError(f"{name}: {width} x {height} pixels; {calibrated}")
 
 
 class Images:
@@ -199,7 +194,7 @@ def _sort_naturally(files):
 def _video_length(path):
     video = cv2.VideoCapture(str(path))
     try:
-        width, height = video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)
+        width, height = map(video.get, (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         if not video.isOpened() or count < 1:
             raise ValueError(f"{path}: can't be opened as a video")

@@ -38,16 +38,14 @@ def merge_pieces(lines, bearing, gap):
 def separate_close_pairs(lines, width):
     """Correct close pairs of opposite polarity, which appear too far apart; `Lines`.
 
-    Their `sigma` grows with the correction. `width` [rad]: standard deviation of the gradient of a
-    sharp edge in this image.
+    Their `sigma` grows with the correction. `width` [rad] of a sharp edge's gradient in this image.
     """
     if len(lines.bearing) < 2:
         return lines
     apart = _bearing_difference(lines)
-    overlap = np.minimum(lines.high[:, None], lines.high) - np.maximum(
-        lines.low[:, None], lines.low
-    )
-    part = np.clip(overlap / (lines.high - lines.low)[:, None], 0, 1)
+    low, high = lines.low, lines.high
+    overlap = np.minimum(high[:, None], high) - np.maximum(low[:, None], low)
+    part = np.clip(overlap / (high - low)[:, None], 0, 1)
     pair = (part > 0.3) & (lines.polarity[:, None] != lines.polarity)
     square = lines.strength**2
     share = square / (square[:, None] + square)  # the weaker line is shifted more
@@ -57,10 +55,8 @@ def separate_close_pairs(lines, width):
     too_far = np.where(pair & (apparent < SEPARATION[-1]), (apparent - true) * width, 0.0)
     push = too_far * share * part * np.sign(apart)
     bearing = lines.bearing - push.sum(axis=1)
-    return lines._replace(
-        bearing=pi - (pi - bearing) % (2 * pi),
-        sigma=np.sqrt(lines.sigma**2 + (too_far**2 * share * part).sum(axis=1) / 4),
-    )
+    sigma = np.sqrt(lines.sigma**2 + (too_far**2 * share * part).sum(axis=1) / 4)
+    return lines._replace(bearing=pi - (pi - bearing) % (2 * pi), sigma=sigma)
 
 
 def _apparent_separation():

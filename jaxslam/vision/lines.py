@@ -111,14 +111,11 @@ def _edges(picture, view, settings):
     channels = picture if settings.colour else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)[..., None]
     levels = cv2.mean(channels, view.valid.view(np.uint8))
     level = max(float(np.mean(levels[: channels.shape[2]])), 1.0)
-    length, gap = (
-        max(2, round(angle / view.row_height)) for angle in (settings.length, settings.gap)
-    )
+    extents = settings.length, settings.gap
+    length, gap = (max(2, round(angle / view.row_height)) for angle in extents)
     contrast = settings.contrast * level / STEP / WIDEST
-    edges = find_edges(
-        channels, view.valid, contrast, settings.significance, length, gap, settings.slope
-    )
-    return edges, level
+    limits = contrast, settings.significance, length, gap, settings.slope
+    return find_edges(channels, view.valid, *limits), level
 
 
 def is_dark(image, level=12.0):
@@ -174,7 +171,6 @@ def _colours(edges, picture, fit):
 
 def _columns_per_pixel(view, stride=90):
     """Width [H] of an image pixel, in columns, in each row of a `Panorama`."""
-    step = [
-        part[:, 1::stride].astype(float) - part[:, :-1:stride] for part in (view.map_x, view.map_y)
-    ]
+    maps = view.map_x, view.map_y
+    step = [part[:, 1::stride].astype(float) - part[:, :-1:stride] for part in maps]
     return 1 / np.maximum(np.median(np.hypot(*step), axis=1), 1e-3)

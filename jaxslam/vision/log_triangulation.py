@@ -13,17 +13,9 @@ import numpy as np
 from jaxslam.logs.log import NOT_USED, Log
 from jaxslam.logs.odometry import increments, moments
 from jaxslam.parameters import Params, default_params
+from jaxslam.vision import triangulation
 from jaxslam.vision.matching import NEAREST, Appearance, match_bearings
-from jaxslam.vision.triangulation import (
-    OK,
-    PARALLEL,
-    REASONS,
-    STILL,
-    TriangulationSettings,
-    compose,
-    sensor_motion,
-    triangulate,
-)
+from jaxslam.vision.triangulation import OK, PARALLEL, REASONS, STILL, TriangulationSettings
 
 PAIRS = ("disjoint", "consecutive", "overlapping")
 NEW, SHORT, MISFIT = range(len(REASONS), len(REASONS) + 3)
@@ -49,9 +41,8 @@ class PointSettings:
 
     Points over the same stretch of road share the error of its odometry, so a filter that assumes
     independent errors becomes overconfident. The log therefore declares a `position_scale`: the
-    square root of `inflation` times the number of overlapping points of a line. Inflating mapped
-    80 % of a simulated room's landmarks where thinning to disjoint pairs mapped 11 %, with equally
-    good paths (experiments/points.py).
+    square root of `inflation` times the number of overlapping points of a line. This mapped 80 % of
+    a simulated room's landmarks, disjoint pairs 11 %, with equal paths (experiments/points.py).
     """
 
     baseline: float = 0.4
@@ -97,7 +88,7 @@ class _Window:
         self.frame = np.append(self.frame, frame - 1)
         start = np.vstack([self.motion, np.zeros((1, 3))])
         start_cov = np.vstack([self.cov, np.zeros((1, 3, 3))])
-        self.motion, self.cov = compose(start, start_cov, motion, cov)
+        self.motion, self.cov = triangulation.compose(start, start_cov, motion, cov)
         self.path = np.append(self.path, 0.0) + distance
         kept = self.path <= longest
         kept[:-MOST_FRAMES] = False
@@ -119,10 +110,9 @@ def triangulate_log(
     """Add `point`, `point_cov` and `point_baseline` to a log; returns the new log.
 
     Bearings without a point are counted by reason in `skipped`. A `position_scale` is declared for
-    the filter unless the log has one. `params`: noise and turning gain of the motion (None: as
-    declared by the log, or the defaults). `use_identity`: match lines by the measured identities.
-    `progress(done, total)` in frames. Raises `ValueError` for a log without bearings, or without
-    identities if they are to be used.
+    the filter unless the log has one. `params`: noise and turning gain of the motion (None: the
+    log's, or the defaults). `use_identity`: match lines by the measured identities.
+    `progress(done, total)` in frames. Raises `ValueError` if the bearings or identities are absent.
     """
     settings = PointSettings() if settings is None else settings
     if log.bearing is None:
@@ -132,7 +122,7 @@ def triangulate_log(
     params = default_params("position", log) if params is None else params
     odometry = increments(log)
     mounting = (params.mount_x, params.mount_y, params.mount_yaw)
-    motion, motion_cov = sensor_motion(*moments(odometry, params), mounting)
+    motion, motion_cov = triangulation.sensor_motion(*moments(odometry, params), mounting)
     lines = _LogLines(log, params, settings, use_identity)
     first = np.searchsorted(log.frame, np.arange(len(log.frame_time) + 1))
     window, tracks = _Window(), []
@@ -140,8 +130,7 @@ def triangulate_log(
     base, outcome = np.full(len(log.frame), np.nan), np.full(len(log.frame), NEW)
     for j in range(len(log.frame_time)):
         if j:
-            step = motion[j], motion_cov[j], odometry.distance[j]
-            window.advance(j, *step, settings.longest)
+            window.advance(j, motion[j], motion_cov[j], odometry.distance[j], settings.longest)
         rows = np.arange(first[j], first[j + 1])
         tracks = _extend_tracks(tracks, j, rows, window, lines, settings)
         current = [t for t in tracks if t.sightings[-1][0] == j and len(t.sightings) > 1]
@@ -149,10 +138,8 @@ def triangulate_log(
         if progress and (j % 50 == 0 or j + 1 == len(log.frame_time)):
             progress(j + 1, len(log.frame_time))
     skipped = {k: v for k, v in log.skipped.items() if not k.startswith(_PREFIX)}
-    counts = np.bincount(outcome, minlength=len(OUTCOMES))
-    skipped |= {
-        _PREFIX + OUTCOMES[i]: int(counts[i]) for i in range(len(OUTCOMES)) if i != OK and counts[i]
-    }
+    counts = np.bincount(outcome[outcome != OK], minlength=len(OUTCOMES)).tolist()
+    skipped |= {_PREFIX + why: n for why, n in zip(OUTCOMES, counts, strict=True) if n}
     noise = {"position_scale": _position_scale(base, odometry.distance, settings)} | log.noise
     points = {"point": point, "point_cov": cov, "point_baseline": base}
     return replace(log, **points, noise=noise, skipped=skipped)
@@ -178,10 +165,8 @@ class _LogLines:
         common = params.sigma_bearing if settings.sigma is None else settings.sigma
         sigma = log.bearing_sigma if settings.sigma is None else None
         self.sigma = np.full(len(log.frame), common) if sigma is None else np.asarray(sigma)
-        self.appearance = None
-        coloured = log.descriptor is not None and log.descriptor.shape[1] == 9
-        if coloured and settings.use_colour:
-            d = log.descriptor
+        self.appearance, d = None, log.descriptor
+        if settings.use_colour and d is not None and d.shape[1] == 9:
             self.appearance = Appearance(d[:, 0], d[:, 1], d[:, 2], d[:, 3:].reshape(-1, 2, 3))
 
     def match(self, before, after, motion, heading_sigma, depth):
@@ -189,11 +174,9 @@ class _LogLines:
         if self.identity is not None:
             same = self.identity[before][:, None] == self.identity[after][None, :]
             return np.argwhere(same & (self.identity[before] >= 0)[:, None])
-        appearances = self.appearance
-        if appearances is not None:
-            appearances = [
-                Appearance(*(part[rows] for part in appearances)) for rows in (before, after)
-            ]
+        seen, appearances = self.appearance, None
+        if seen is not None:
+            appearances = [Appearance(*(part[rows] for part in seen)) for rows in (before, after)]
         bearings, sigmas = ((part[before], part[after]) for part in (self.bearing, self.sigma))
         return match_bearings(bearings, sigmas, motion, appearances, heading_sigma, depth)
 
@@ -241,8 +224,7 @@ def _triangulate_tracks(tracks, window, lines, settings, out):
     ready = [i for i, index in enumerate(start) if index is not None]
     if not ready:
         return
-    first = [tracks[i].sightings[start[i]] for i in ready]
-    row = row[ready]
+    first, row = [tracks[i].sightings[start[i]] for i in ready], row[ready]
     points = _triangulate(first, row, window, lines, settings)
     between = [_sighting_between(tracks[i], start[i], window) for i in ready]
     fits = _confirm_between(points.point, first, between, window, lines)
@@ -283,9 +265,8 @@ def _confirm_between(point, first, between, window, lines):
     row = np.array([row for _, row in between])
     x, y, turn = window.motion[at].T
     c, s = np.cos(turn), np.sin(turn)
-    expected = np.arctan2(
-        y + s * point[:, 0] + c * point[:, 1], x + c * point[:, 0] - s * point[:, 1]
-    )
+    px, py = point.T
+    expected = np.arctan2(y + s * px + c * py, x + c * px - s * py)
     off = np.abs((lines.bearing[row] - expected + np.pi) % (2 * np.pi) - np.pi)
     # Half-way, the two ends constrain the heading (a Brownian bridge): a quarter of its variance
     # remains, and each end adds a quarter of a bearing's variance.
@@ -296,7 +277,6 @@ def _confirm_between(point, first, between, window, lines):
 def _triangulate(first, row, window, lines, settings):
     """`Points` of rows [m] of the present frame, each from an earlier sighting (frame, row)."""
     at = window.index([frame for frame, _ in first])
-    earlier = np.array([earlier for _, earlier in first])
-    bearing = np.column_stack([lines.bearing[earlier], lines.bearing[row]])
-    sigma = np.column_stack([lines.sigma[earlier], lines.sigma[row]])
-    return triangulate(bearing, sigma, window.motion[at], window.cov[at], settings.triangulation)
+    pair = np.column_stack([[earlier for _, earlier in first], row])
+    motion, cov, limits = window.motion[at], window.cov[at], settings.triangulation
+    return triangulation.triangulate(lines.bearing[pair], lines.sigma[pair], motion, cov, limits)

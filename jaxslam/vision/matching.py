@@ -103,15 +103,13 @@ def _elevation_cost(before, after):
 
 def _polarity_cost(before, after):
     """Cost [n, m] of unequal polarity, which may occur as the background of an edge changes."""
-    differs = np.asarray(before.polarity)[:, None] != np.asarray(after.polarity)[None, :]
-    return 4.0 * differs
+    return 4.0 * (np.asarray(before.polarity)[:, None] != np.asarray(after.polarity)[None, :])
 
 
 def _colour_cost(before, after, cost):
     """Cost [n, m] of colours, after the gain of the light. Each side is capped separately, since
     one side of an edge may be a distant background."""
-    first = np.asarray(before.colour, float)
-    second = np.asarray(after.colour, float)
+    first, second = (np.asarray(part.colour, float) for part in (before, after))
     gain = light_gain(first, second, cost)
     dark = np.minimum(gain, 1.0)  # compare in the light of the darker frame: noise is not amplified
     difference = second[None, :] * (dark / gain) - first[:, None] * dark
@@ -127,17 +125,15 @@ def light_gain(before, after, cost):
     `before` [n, 2, 3], `after` [m, 2, 3]; `cost` [n, m] of everything but the colour. The cheapest
     partners of every line count; the median tolerates wrong ones.
     """
-    likely = cost <= np.minimum(cost.min(axis=1, keepdims=True) + 1.0, 8.0)
-    i, j = np.nonzero(likely)
+    i, j = np.nonzero(cost <= np.minimum(cost.min(axis=1, keepdims=True) + 1.0, 8.0))
     if len(i) == 0:
         return np.ones(before.shape[-1])
     # Dark and saturated sides tell little about the light; 0.02 limits the darkest ratios.
     first, second = before[i].reshape(-1, 3), after[j].reshape(-1, 3)
     ratio = np.log((second + 0.02) / (first + 0.02))
     clear = (np.minimum(first, second) > 0.05) & (np.maximum(first, second) < 0.98)
-    gains = [
-        np.median(r[use]) if use.any() else 0.0 for r, use in zip(ratio.T, clear.T, strict=True)
-    ]
+    channels = zip(ratio.T, clear.T, strict=True)
+    gains = [np.median(r[use]) if use.any() else 0.0 for r, use in channels]
     return np.exp(np.clip(gains, -1.5, 1.5))
 
 
@@ -145,5 +141,4 @@ def assign_pairs(cost, unmatched):
     """Cheapest one-to-one assignment [m, 2], without pairs dearer than two unmatched lines."""
     gain = np.minimum(cost - 2 * unmatched, 0.0)
     rows, columns = linear_sum_assignment(gain)
-    good = gain[rows, columns] < 0
-    return np.column_stack([rows[good], columns[good]])
+    return np.column_stack([rows, columns])[gain[rows, columns] < 0]

@@ -48,8 +48,8 @@ class Panorama(NamedTuple):
 
     def row(self, elevation):
         """Fractional row of an elevation [rad]."""
-        spacing = self.elevation[0] - self.elevation[-1]
-        return (self.elevation[0] - np.asarray(elevation)) / spacing * (len(self.elevation) - 1)
+        up = self.elevation
+        return (up[0] - np.asarray(elevation)) / (up[0] - up[-1]) * (len(up) - 1)
 
 
 class View(NamedTuple):
@@ -92,23 +92,19 @@ def perspective(camera, azimuth=0.0, elevation=0.0, field=pi / 2, width=640, hei
     focal = width / 2 / np.tan(field / 2)
     right = (np.arange(width) - (width - 1) / 2)[None, :]
     down = (np.arange(height) - (height - 1) / 2)[:, None]
-    ahead = directions(azimuth, elevation)
-    left = directions(azimuth + pi / 2, 0.0)
+    ahead, left = directions(azimuth, elevation), directions(azimuth + pi / 2, 0.0)
     up = np.cross(ahead, left)
-    direction = focal * ahead - right[..., None] * left - down[..., None] * up
-    return _view(camera, direction)
+    return _view(camera, focal * ahead - right[..., None] * left - down[..., None] * up)
 
 
 @lru_cache(maxsize=CACHED)
 def birds_eye(camera, extent=4.0, size=512):
     """`View` of the floor from above with the robot's heading upwards; cached.
 
-    `extent` [m]: half the side of a square around the robot's origin; `size` px. The camera's
-    height is part of its `position`. Black where it does not see the floor. Raises `ValueError` if
-    the height is not above 0.
+    `extent` [m]: half the side of a square around the robot's origin; `size` px. Black where the
+    camera does not see the floor. Raises `ValueError` unless its height (`position`) is above 0.
     """
-    if camera.position[2] <= 0:
-        height = camera.position[2]
+    if (height := camera.position[2]) <= 0:
         raise ValueError(f"birds_eye: the camera is {height:g} m above the floor; set its height")
     metres = extent * (1 - (2 * np.arange(size) + 1) / size)
     floor = np.stack([*np.meshgrid(metres, metres, indexing="ij"), np.zeros((size, size))], -1)
@@ -132,8 +128,7 @@ def _extent(camera, low, high):
             f"{np.degrees(high):.1f} deg; check its elevation, mirror and lens"
         )
     length = np.nansum(np.hypot(*np.moveaxis(np.diff(pixel, axis=1), -1, 0)), 1).max()
-    rows = int(np.clip(round(length), LEAST_ROWS, MOST_ROWS))
-    return up[seen[0]], up[seen[-1]], rows
+    return up[seen[0]], up[seen[-1]], int(np.clip(round(length), LEAST_ROWS, MOST_ROWS))
 
 
 def directions(azimuth, elevation):

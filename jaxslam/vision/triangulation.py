@@ -67,8 +67,7 @@ def triangulate(bearing, sigma, motion, motion_cov, settings=None):
 
     `bearing` [m, 2] rad in the first and second sensor frame; `sigma`, [m, 2] or a number, their
     standard deviations; `motion` [3] or [m, 3]: pose (x, y, heading) of the second sensor in the
-    frame of the first; `motion_cov` [3, 3] or [m, 3, 3], its covariance. Errors of the bearings and
-    of the motion are assumed independent.
+    frame of the first; `motion_cov` [3, 3] or [m, 3, 3]. All errors are assumed independent.
     """
     settings = TriangulationSettings() if settings is None else settings
     bearing = np.asarray(bearing, float).reshape(-1, 2)
@@ -124,14 +123,10 @@ def _intersect(bearing, motion):
 
 def _reasons(ranges, parallax, baseline, settings):
     """Index [m] of the first of `REASONS` that applies."""
-    far, near = ranges.max(axis=1), ranges.min(axis=1)
-    conditions = [
-        baseline < settings.least_baseline,
-        ~(parallax >= settings.parallax),
-        ~(near > 0),
-        ranges[:, 1] < settings.nearest,
-        far > settings.farthest,
-    ]
+    still, parallel = baseline < settings.least_baseline, ~(parallax >= settings.parallax)
+    behind, near = ~(ranges.min(axis=1) > 0), ranges[:, 1] < settings.nearest
+    far = ranges.max(axis=1) > settings.farthest
+    conditions = [still, parallel, behind, near, far]
     return np.select(conditions, [STILL, PARALLEL, BEHIND, NEAR, FAR], OK)
 
 

@@ -192,7 +192,7 @@ def test_a_process_that_dies_ends_the_run_in_one_line(there, victim):
 
 
 def meeting(*parties, limit=20.0):
-    """What `meet` gives or raises for each (place, run); all at once."""
+    """What `rendezvous` returns or raises for each (place, run); all at once."""
     found = {}
 
     def one(index, place, run):
@@ -222,7 +222,7 @@ def test_all_meet_and_whoever_does_not_fit_is_named_on_every_side():
     other = {"seed": 2, "config": {"particles": 20}, "log": "b"}
     said = meeting((pair[0], run), (pair[1], other))
     differing = "seed (1, now 2), particles (10, now 20), log"
-    assert said == [f"process 1 was told otherwise than process 0: {differing}"] * 2
+    assert said == [f"process 1 has other settings than process 0: {differing}"] * 2
 
     said = meeting((places[0], run), (places[1], run), (places[1], run))
     assert said == ["two processes have --process-id 1"] * 3
@@ -233,13 +233,15 @@ def test_all_meet_and_whoever_does_not_fit_is_named_on_every_side():
 def test_whoever_is_missing_is_named(monkeypatch):
     port = free_port()
     lead, other = (ClusterAddress("127.0.0.1", port, 2, i) for i in range(2))
-    told = f"process 1 did not come to 127.0.0.1:{port} within 0.5 s"
-    assert meeting((lead, {}), limit=0.5) == [told]
+    told = f"process 1 did not connect to 127.0.0.1:{port} within 0.5 s"
+    assert meeting((lead, {}), limit=0.5) == [f"{told}; start all processes together"]
     (said,) = meeting((other, {}), limit=0.5)
-    assert said.startswith(f"no process 0 at 127.0.0.1:{port} within 0.5 s: ")
+    assert said.startswith(f"can't reach process 0 at 127.0.0.1:{port} within 0.5 s: ")
     with socket.create_server(("127.0.0.1", port)):
         said = meeting((lead, {}))
-    assert said == [f"can't wait at 127.0.0.1:{port}: address already in use"]
+    assert said == [
+        f"can't listen at 127.0.0.1:{port}: address already in use; choose another --coordinator"
+    ]
 
 
 def test_a_missing_process_ends_the_command_with_69(at, short, call, monkeypatch):
@@ -247,7 +249,7 @@ def test_a_missing_process_ends_the_command_with_69(at, short, call, monkeypatch
     words = "run", short, "--num-processes", 2, "--coordinator", f"127.0.0.1:{free_port()}"
     code, out, err = call(*words, "--process-id", 0)
     assert (code, out, err.count("\n")) == (69, "", 1)
-    assert err.startswith("jaxslam: process 1 did not come to 127.0.0.1:")
+    assert err.startswith("jaxslam: process 1 did not connect to 127.0.0.1:")
     assert os.listdir() == []
 
 
@@ -256,7 +258,7 @@ def test_options_that_do_not_fit_are_refused(at, short, refuse):
     run = "run", short
     three = *run, "--coordinator", "127.0.0.1:4321", "--num-processes", 2
     assert "--process-id missing; --coordinator, --num-processes, --process-id go" in refuse(*three)
-    assert "--process-id is 2; of 2 it must be 0 to 1" in refuse(*three, "--process-id", 2)
+    assert "--process-id is 2; must be 0 to 1" in refuse(*three, "--process-id", 2)
     line = "which 3 devices can't share evenly; take 999 or 1002"
     assert line in refuse(*run, "--devices", 3)
     assert "which 4 devices can't share evenly; take 4" in refuse(

@@ -166,10 +166,7 @@ def test_another_run_is_not_gone_on_with(there, log, call, refuse, monkeypatch):
     resume = *LONG, "--resume"
     assert "differing: particles (30, now 41)" in refuse(*RUN[:-1], 41, "--out", "out", "--resume")
     line = refuse(*resume, "--seed", 1, "--proposal", "informed")
-    assert (
-        "out: the checkpoint is of another run; differing: seed (0, now 1), proposal (prior, now"
-        in line
-    )
+    assert "out: holds another run; differing: seed (0, now 1), proposal (prior, now inf" in line
     (there / "p.toml").write_text("sigma_range = 0.25\n")
     assert "differing: sigma_range (" in refuse(*resume, "--params", "p.toml")
     assert refuse(*resume, "--start", 0.5).endswith("; differing: frames, log\n")
