@@ -22,7 +22,6 @@ from jaxslam.parameters import Params, default_params
 from jaxslam.reference import ekf
 from jaxslam.reference import fastslam as baseline
 from jaxslam.results.metrics import ate
-from jaxslam.results.tables import format_table
 
 
 class Agreement(NamedTuple):
@@ -165,9 +164,11 @@ def table(comparisons):
         ("  baseline / filter, compiling", "{3[3]:.4g} times"),
         ("  baseline / filter", "{3[4]:.4g} times"),
     ]
-    numbers = [(row.double, row.single, row, _times(row)) for row in comparisons]
-    lines = [(name, *(cell.format(*given) for given in numbers)) for name, cell in rows]
-    return format_table(lines, "<>", (32, 18))
+    lines = []
+    for name, cell in rows:
+        cells = [cell.format(row.double, row.single, row, _times(row)) for row in comparisons]
+        lines.append(f"{name:32}" + "".join(f"{text:>20}" for text in cells))
+    return "\n".join(lines)
 
 
 def _times(row):

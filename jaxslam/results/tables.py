@@ -28,32 +28,25 @@ NUMBERS = (
 )
 
 
-def format_table(rows, align=">", least=(0,)):
-    """Format rows of texts as lines of aligned columns, with two spaces between.
-
-    `align`: `<` or `>` of each column; `least`: least width of each. The last one given counts for
-    all further columns.
-    """
+def format_table(rows, align):
+    """Format rows of texts as lines, in columns aligned by `align`: `<` or `>` for each."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    widths = [max(width, least[min(i, len(least) - 1)]) for i, width in enumerate(widths)]
-    sides = align.ljust(len(widths), align[-1])
     return "\n".join(
-        "  ".join(f"{text:{s}{w}}" for text, s, w in zip(row, sides, widths, strict=True)).rstrip()
+        "  ".join(f"{text:{a}{w}}" for text, a, w in zip(row, align, widths, strict=True)).rstrip()
         for row in rows
     )
 
 
 def error_table(summary):
-    """Format the errors in a summary: of what was estimated, and of dead reckoning."""
+    """Format the errors in a `summary` (`summary.json` as a dict) as text for people."""
     lines = []
     if "ate_filtered_unaligned_rmse_m" in summary:
         heads = "aligned RMSE", "unaligned RMSE", "unaligned max", "at the end"
-        lines.append(_format_row("", heads))
+        lines.append(_row("", heads))
         for label, (name, rmse, end) in PATHS.items():
             if f"{name}_unaligned_rmse_m" in summary:
                 keys = [f"{name}_{key}" for key in (rmse, "unaligned_rmse_m", "unaligned_max_m")]
-                errors = [_format_metres(summary, key) for key in (*keys, f"{end}_end_m")]
-                lines.append(_format_row(label, errors))
+                lines.append(_error_row(label, summary, (*keys, f"{end}_end_m")))
     for label, (name, counts) in MAPS.items():
         lines += _map_lines(summary, label, name, counts)
     for key, label, scale, unit in NUMBERS:
@@ -65,11 +58,10 @@ def error_table(summary):
 
 
 def _map_lines(summary, label, name, counts):
-    """Lines about one map: its errors, and how many true landmarks it has."""
+    """Return lines about one map: its errors, and how many true landmarks it has."""
     if f"{counts}_unaligned_matched" not in summary:
         return []
-    keys = f"{name}_rmse_m", f"{name}_unaligned_rmse_m"
-    lines = [_format_row(label, [_format_metres(summary, key) for key in keys])]
+    lines = [_error_row(label, summary, (f"{name}_rmse_m", f"{name}_unaligned_rmse_m"))]
     for kind, title in ((counts, "aligned: "), (f"{counts}_unaligned", "unaligned: ")):
         if f"{kind}_matched" in summary:
             numbers = [f"{summary[f'{kind}_{k}']} {k}" for k in ("matched", "missed", "spurious")]
@@ -79,9 +71,9 @@ def _map_lines(summary, label, name, counts):
     return lines
 
 
-def _format_row(label, cells):
-    return format_table([(label, *cells)], "<>", (24, 14))
+def _row(label, cells):
+    return f"{label:24}" + "".join(f"{cell:>16}" for cell in cells)
 
 
-def _format_metres(summary, key):
-    return f"{summary[key]:.3f} m" if key in summary else "-"
+def _error_row(label, summary, keys):
+    return _row(label, [f"{summary[key]:.3f} m" if key in summary else "-" for key in keys])

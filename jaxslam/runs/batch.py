@@ -213,7 +213,7 @@ def format_runs(rows):
             for label, statistic in (("mean", np.mean), ("sd", partial(np.std, ddof=1))):
                 summary = {name: statistic(column) for name, column in columns.items()}
                 lines.append([label, *values, *_cells(summary, shown)])
-    return format_table(lines)
+    return format_table(lines, ">" * len(lines[0]))
 
 
 def _value(value):
