@@ -33,46 +33,40 @@ def load_result(directory: str | Path, log: str | Path | None = None) -> Result:
         with open(directory / "steps.npz", "rb") as f, np.load(f, allow_pickle=False) as archive:
             names = {stored: name for name, stored in FILE_NAMES.items()}
             steps = {names.get(stored, stored): archive[stored] for stored in archive.files}
-            columns = {
-                f.name: steps[f.name]
-                for f in fields(Result)
-                if f.metadata and (f.name in steps or f.default is MISSING)
-            }
-            landmarks = MapEstimate(**_columns_of("map", steps))
-            columns |= _smoother_columns(steps)
-        seed, source = settings["seed"], settings["log"]
-        spent = {name: summary[name] for name in ("seconds", "compile_seconds", "dropped")}
-        spent["refine_seconds"] = summary.get("refine_seconds")
+        columns = [f for f in fields(Result) if f.metadata]
+        known = {f.name: steps[f.name] for f in columns if f.name in steps or f.default is MISSING}
+        known["landmarks"] = MapEstimate(**_columns_of("map", steps))
+        known |= _smoother_tables(steps) | {"seed": settings["seed"]}
+        known |= {name: summary[name] for name in ("seconds", "compile_seconds", "dropped")}
+        known["refine_seconds"], source = summary.get("refine_seconds"), settings["log"]
     except FileNotFoundError as error:
-        problem = f"no {Path(error.filename).name}; not a run's folder"
-        raise ValueError(f"{directory}: {problem}") from None
+        missing = Path(error.filename).name
+        raise ValueError(f"{directory}: no {missing}; not a run's folder") from None
     except (OSError, KeyError, TypeError, ValueError, EOFError, BadZipFile, zlib.error) as error:
         raise ValueError(f"{directory}: a broken run's folder ({error}); run it again") from error
-    used = _find_log(directory, source) if log is None else load_log(log)
-    if not np.isin(columns["time"], used.frame_time).all():
+    used = _load_log_of(directory, source) if log is None else load_log(log)
+    if not np.isin(known["time"], used.frame_time).all():
         problem = f"{used.name} is not the log of this run (frame times differ)"
         raise ValueError(f"{directory}: {problem}")
-    return Result(
-        log=used, config=config, params=params, seed=seed, landmarks=landmarks, **columns, **spent
-    )
+    return Result(log=used, config=config, params=params, **known)
 
 
 def _columns_of(name, steps):
-    """Return the columns of one table in `steps.npz`; those of no dimension as numbers."""
+    """Return the columns of one table in `steps.npz`; scalars as numbers."""
     start = f"{name}_"
     columns = {key.removeprefix(start): steps[key] for key in steps if key.startswith(start)}
     return {key: value if value.ndim else value.item() for key, value in columns.items()}
 
 
-def _smoother_columns(steps):
-    """Return the tables of `SMOOTHED` that are there; older folders have none."""
-    found = {name: _columns_of(name, steps) for name in SMOOTHED}
+def _smoother_tables(steps):
+    """Return the tables of `SMOOTHED` that the folder has; old folders have none."""
+    tables = {name: _columns_of(name, steps) for name in SMOOTHED}
     kinds = {"ancestral": Ancestral, "lineage": Lineage}
-    if found["refined"]:
-        from jaxslam.smoother.refine import Refined  # brings JAX, which nothing else here needs
+    if tables["refined"]:
+        from jaxslam.smoother.refine import Refined  # imports JAX, which nothing else here needs
 
         kinds["refined"] = Refined
-    return {name: kind(**found[name]) for name, kind in kinds.items() if found[name]}
+    return {name: kind(**tables[name]) for name, kind in kinds.items() if tables[name]}
 
 
 def evaluate_folder(directory, log=None):
@@ -80,7 +74,7 @@ def evaluate_folder(directory, log=None):
     return compute_errors(load_result(directory, log))
 
 
-def _find_log(directory, source):
+def _load_log_of(directory, source):
     try:
         return load_log(source if source in BUNDLED else directory / source)
     except ValueError as error:

@@ -89,9 +89,8 @@ def rpe(estimate, truth, distance=1.0, time=None, seconds=None):
     if start.size == 0:
         return np.nan, np.nan
     error = relative_pose(estimate[start], estimate[end]) - relative_pose(truth[start], truth[end])
-    error[:, 2] = wrap(error[:, 2])
-    square = (error[:, :2] ** 2).sum(1), error[:, 2] ** 2
-    return float(np.sqrt(np.mean(square[0]))), float(np.sqrt(np.mean(square[1])))
+    squares = (error[:, :2] ** 2).sum(1), wrap(error[:, 2]) ** 2
+    return float(np.sqrt(np.mean(squares[0]))), float(np.sqrt(np.mean(squares[1])))
 
 
 def relative_pose(a, b):
@@ -199,68 +198,66 @@ def association_accuracy(result, log=None, landmark_id=None):
 
 
 def compute_errors(result: "Result", log: Log | None = None) -> dict[str, float | int]:
-    """Compute the errors of a run for `summary.json`, without those that can't be computed.
+    """Compute the errors of a run for `summary.json`, as far as the log has truth for them.
 
-    Empty without truth. `log`: with the truth (None: the result's).
+    `log`: the log with the truth, if that is not the result's.
     """
     log = result.log if log is None else log
-    found = {"association_accuracy": association_accuracy(result, log)}
+    errors = {"association_accuracy": association_accuracy(result, log)}
     if result.refined is not None:
-        again = association_accuracy(result, log, result.refined.landmark_id)
-        found["association_accuracy_refined"] = again
+        refined_accuracy = association_accuracy(result, log, result.refined.landmark_id)
+        errors["association_accuracy_refined"] = refined_accuracy
     if log.truth is not None:
         true = truth_at(log.truth, result.time)
         if has_truth(true).any():
-            found |= path_errors(result, true, log.truth.resolution)
+            errors |= path_errors(result, true, log.truth.resolution)
         if log.truth.landmarks is not None and len(log.truth.landmarks):
-            found |= landmark_errors(result, log.truth, true)
-    return {key: value for key, value in found.items() if np.isfinite(value)}
+            errors |= landmark_errors(result, log.truth, true)
+    return {key: value for key, value in errors.items() if np.isfinite(value)}
 
 
 def path_estimates(result):
     """Return the paths [T, 3] of a run by name: filtered, ancestral, refined, dead_reckoning."""
-    found = {"filtered": result.pose}
-    for name in ("ancestral", "refined"):
-        if getattr(result, name) is not None:
-            found[name] = getattr(result, name).pose
-    return found | {"dead_reckoning": result.dead_reckoning}
+    smoothed = {"ancestral": result.ancestral, "refined": result.refined}
+    smoothed = {name: table.pose for name, table in smoothed.items() if table is not None}
+    return {"filtered": result.pose, **smoothed, "dead_reckoning": result.dead_reckoning}
 
 
 def path_errors(result, true, resolution):
     """Compute the errors that need true poses [T, 3]."""
-    found = {"truth_frames": int(has_truth(true).sum())}
-    if resolution > 0.1:  # coarser truth says nothing about one metre
-        found["truth_resolution_m"] = float(resolution)
+    errors = {"truth_frames": int(has_truth(true).sum())}
+    if resolution > 0.1:  # too coarse for errors per metre
+        errors["truth_resolution_m"] = float(resolution)
     for name, path in path_estimates(result).items():
-        found |= _path_errors(name, path, true, resolution)
-    found |= _consistency("nees", result.pose, result.cov, true, resolution)
-    if result.refined is not None:
-        refined = result.refined
-        found |= _consistency("nees_refined", refined.pose, refined.cov, true, resolution)
-    return found
+        errors |= _path_errors(name, path, true, resolution)
+    errors |= _consistency("nees", result, true, resolution)
+    return errors | _consistency("nees_refined", result.refined, true, resolution)
 
 
 def _path_errors(name, path, true, resolution):
     """Compute errors of one path [T, 3], by their names in summary.json."""
-    ours = name != "dead_reckoning"
-    (rmse, most), unaligned = ate(path, true), ate(path, true, align=False)
-    ate_name = f"ate_{name}" if ours else f"{name}_ate"
-    found = {f"{ate_name}_rmse_m" if ours else f"{ate_name}_m": rmse, f"{ate_name}_max_m": most}
-    found[f"{ate_name}_unaligned_rmse_m"], found[f"{ate_name}_unaligned_max_m"] = unaligned
+    estimated = name != "dead_reckoning"
+    start, rmse = (f"ate_{name}", "rmse_m") if estimated else (f"{name}_ate", "m")
+    errors = dict(zip((f"{start}_{rmse}", f"{start}_max_m"), ate(path, true), strict=True))
+    rmse, most = ate(path, true, align=False)
+    errors |= {f"{start}_unaligned_rmse_m": rmse, f"{start}_unaligned_max_m": most}
     last = np.flatnonzero(has_truth(true))[-1]
-    found[f"{name}_end_m"] = float(np.hypot(*(path - true)[last, :2]))
+    errors[f"{name}_end_m"] = float(np.hypot(*(path - true)[last, :2]))
     heading = wrap(path[:, 2] - true[:, 2])
-    if ours and np.isfinite(heading).any():
-        found[f"heading_{name}_rmse_rad"] = float(np.sqrt(np.nanmean(heading**2)))
+    if estimated and np.isfinite(heading).any():
+        errors[f"heading_{name}_rmse_rad"] = float(np.sqrt(np.nanmean(heading**2)))
     if resolution <= 0.1:
-        kind = "" if name == "filtered" else f"{name}_"
-        found[f"{kind}rpe_1m_m"], found[f"{kind}rpe_1m_rad"] = rpe(path, true)
-    return found
+        start = "" if name == "filtered" else f"{name}_"
+        errors[f"{start}rpe_1m_m"], errors[f"{start}rpe_1m_rad"] = rpe(path, true)
+    return errors
 
 
-def _consistency(name, pose, cov, true, resolution):
-    squared = nees(pose, cov, true, resolution)
-    squared = squared[np.isfinite(squared)]
+def _consistency(name, estimate, true, resolution):
+    """Compute median NEES and share of frames in the 99 % region, if there are any."""
+    squared = np.zeros(0)
+    if estimate is not None:
+        squared = nees(estimate.pose, estimate.cov, true, resolution)
+        squared = squared[np.isfinite(squared)]
     if not squared.size:
         return {}
     within = float(np.mean(squared <= chi2.ppf(0.99, 3)))
@@ -269,24 +266,18 @@ def _consistency(name, pose, cov, true, resolution):
 
 def landmark_errors(result, truth, true):
     """Compute the errors that need true landmarks; each map is aligned as its path [T, 3] is."""
-    found = _landmark_errors("filtered", "landmarks", result.pose, result.landmarks, truth, true)
+    maps = [("filtered", "landmarks", result.pose, result.landmarks)]
     if result.refined is not None:
-        path, world = result.refined.pose, result.landmarks_refined
-        found |= _landmark_errors("refined", "landmarks_refined", path, world, truth, true)
-    return found
-
-
-def _landmark_errors(name, counts, path, landmarks, truth, true):
-    """Compute errors of the map that belongs to a path [T, 3]."""
-    have = has_truth(true)
-    kinds = {"_unaligned": None}
-    if alignable(true[have, :2]):
-        kinds[""] = align_se2(path[have, :2], true[have, :2])
-    found = {}
-    for kind, motion in kinds.items():
-        error = map_error(landmarks.mean, landmarks.identity, truth, motion)
-        found[f"landmark_{name}{kind}_rmse_m"] = error.get("rmse_m", np.nan)
-        found["landmark_gate_m"] = error.get("gate_m", np.nan)
-        for how in ("matched", "missed", "spurious"):
-            found[f"{counts}{kind}_{how}"] = error[how]
-    return found
+        maps += [("refined", "landmarks_refined", result.refined.pose, result.landmarks_refined)]
+    have, errors = has_truth(true), {}
+    for name, counts, path, landmarks in maps:
+        motions = {"_unaligned": None}
+        if alignable(true[have, :2]):
+            motions[""] = align_se2(path[have, :2], true[have, :2])
+        for kind, motion in motions.items():
+            error = map_error(landmarks.mean, landmarks.identity, truth, motion)
+            errors[f"landmark_{name}{kind}_rmse_m"] = error.get("rmse_m", np.nan)
+            errors["landmark_gate_m"] = error.get("gate_m", np.nan)
+            for count in ("matched", "missed", "spurious"):
+                errors[f"{counts}{kind}_{count}"] = error[count]
+    return errors

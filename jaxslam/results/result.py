@@ -89,10 +89,8 @@ class Result:
     entropy: np.ndarray | None = field(default=None, metadata=COLUMN)
 
     def __repr__(self):
-        frames, marks = len(self.time), len(self.landmarks.mean)
-        return (
-            f"Result({self.log.name!r}, {self.config.sensor}, {frames} frames, {marks} landmarks)"
-        )
+        counts = f"{len(self.time)} frames, {len(self.landmarks.mean)} landmarks"
+        return f"Result({self.log.name!r}, {self.config.sensor}, {counts})"
 
     def trajectory_columns(self) -> dict[str, np.ndarray]:
         """Return the trajectory as columns [T], for `pandas.DataFrame` for example.
@@ -127,8 +125,9 @@ class Result:
     @property
     def landmarks_refined(self) -> MapEstimate | None:
         """The refined map, or None."""
-        r = self.refined
-        return r and MapEstimate(r.id, r.mean, r.landmark_cov, r.n, r.identity)
+        if (r := self.refined) is None:
+            return None
+        return MapEstimate(r.id, r.mean, r.landmark_cov, r.n, r.identity)
 
     @property
     def log_likelihood(self) -> float:
@@ -137,15 +136,12 @@ class Result:
 
     @cached_property
     def flags(self) -> list[str]:
-        """One line for everything that was lost or went wrong; empty when nothing did."""
+        """Warnings: a line for everything that was lost or went wrong."""
         lines = [f"{count} measurements left out: {why}" for why, count in self.dropped.items()]
-        lines += [
-            f"{count} rows skipped by the reader: {why}"
-            for why, count in self.log.skipped.items()
-            if not why.startswith(NOT_USED)
-        ]
-        lost = float(np.sum(self.overflow))
-        if lost > 0:
+        for why, count in self.log.skipped.items():
+            if not why.startswith(NOT_USED):
+                lines.append(f"{count} rows skipped by the reader: {why}")
+        if (lost := float(np.sum(self.overflow))) > 0:
             frame = int(np.flatnonzero(self.overflow)[0])
             lines.append(
                 f"the map was full from frame {frame} on: {lost:.1f} landmarks lost per particle; "
@@ -163,15 +159,14 @@ class Result:
 
     @cached_property
     def advice(self) -> list[str]:
-        """One line for everything that is no fault but should be known."""
+        """Notes: a line for everything that is no fault but limits what the result says."""
         return self._describe_shared_past() + self._describe_failures() + self._describe_warp()
 
     def _describe_failures(self):
         """Return a line if rejuvenation failed."""
         failed = 0 if self.events is None else int(np.sum(self.events[:, 1] == FAILED))
-        if not failed:
-            return []
-        return [f"rejuvenation failed {failed} times, since the path could not be refined"]
+        line = f"rejuvenation failed {failed} times, since the path could not be refined"
+        return [line] if failed else []
 
     def _describe_warp(self):
         """Return a line if the filter's map and the refined one, of common landmarks, disagree."""
@@ -212,7 +207,7 @@ class Result:
     def save(
         self, directory: str | Path, overwrite: bool = False, log_source: str | None = None
     ) -> None:
-        """Write the run folder (`run_folder.save`); without `log_source` with its log."""
+        """Write a run folder (`run_folder.save`), which holds the log unless it has a source."""
         from jaxslam.results import run_folder  # here: it brings matplotlib
 
         run_folder.save(self, directory, overwrite=overwrite, log_source=log_source)

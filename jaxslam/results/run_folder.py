@@ -1,10 +1,7 @@
-"""Write the run folder: all of it or nothing.
+"""Write the run folder, all of it or nothing (docs/reference/file-formats.md lists its files).
 
-`run.toml` has all settings, `summary.json` the errors and warnings, `events.jsonl` what happened in
-which frame, `steps.npz` every array of the result. For other tools: `trajectory.tum` and
-`landmarks.csv` are the filter's estimates; `trajectory_refined.tum` and `landmarks_refined.csv` the
-refined ones, if there are any. The folder of a run with checkpoints (`runs.checkpoints`) exists
-from its beginning; there `summary.json` appears last.
+The folder of a run with checkpoints (`runs.checkpoints`) exists from its beginning; there
+`summary.json` appears last.
 """
 
 import json
@@ -27,29 +24,25 @@ from jaxslam.results.events import ambiguous_measurements, list_events
 from jaxslam.results.figures import FIGURES, draw_figures
 from jaxslam.results.metrics import compute_errors
 
-# Columns of `steps.npz` that keep the name they have had since version 0.1.
-FILE_NAMES = {
+FILE_NAMES = {  # columns of `steps.npz` that keep their name of version 0.1
     "landmark_id": "match",
     "lineage_landmark_id": "lineage_birth",
     "refined_landmark_id": "refined_match",
 }
-NEEDED = ("run.toml", "summary.json", "steps.npz")  # every run folder has these
-FINISHED = "summary.json"
-CHECKPOINTS, PARTIAL = "checkpoints", ".results"
-WORKING = (run_lock.NAME, CHECKPOINTS, PARTIAL)  # only in an unfinished run folder
-SMOOTHED = ("ancestral", "lineage", "refined")  # tables that not every run has
-FILES = (
-    *(*NEEDED, "trajectory.tum", "landmarks.csv", "events.jsonl", "log.npz", *FIGURES),
-    *("trajectory_refined.tum", "landmarks_refined.csv"),
-)
+SMOOTHED = "ancestral", "lineage", "refined"  # tables of `steps.npz` that not every run has
+
+FINISHED, CHECKPOINTS, PARTIAL = "summary.json", "checkpoints", ".results"
+NEEDED = "run.toml", FINISHED, "steps.npz"  # in every finished run folder
+WORKING = run_lock.NAME, CHECKPOINTS, PARTIAL  # only in an unfinished one
+OPTIONAL = "log.npz", "trajectory_refined.tum", "landmarks_refined.csv", *FIGURES
+FILES = *NEEDED, "trajectory.tum", "landmarks.csv", "events.jsonl", *OPTIONAL
 
 
 def save(result, directory, overwrite=False, log_source=None, figures=True):
     """Write a run folder; all of it appears at once, or nothing does.
 
-    `log_source`: path or name that the log was loaded from; without one the log is stored in the
-    folder. Raises `ValueError` if the folder can't be written, or exists and is not a run folder to
-    `overwrite`.
+    `log_source`: path or name that the log was loaded from; None: the log is stored in the folder.
+    Raises `ValueError` if the folder can't be written, or exists (`overwrite`: and is no run's).
     """
     directory = Path(directory)
     check_target(directory, overwrite)
@@ -63,10 +56,9 @@ def save(result, directory, overwrite=False, log_source=None, figures=True):
 
 
 def save_into(result, directory, log_source=None):
-    """Write the results of a run with checkpoints into its folder, which exists.
+    """Write the results of a run with checkpoints into its folder; `summary.json` appears last.
 
-    It stays unfinished until `summary.json`, the last file, is there. Raises `OSError` without
-    space on the disk.
+    Raises `OSError` if there is no space on the disk.
     """
     directory = Path(directory)
     partial = directory / PARTIAL
@@ -89,10 +81,10 @@ def clear_results(directory):
 
 
 def check_target(directory, overwrite=False, resume=False):
-    """Raise `ValueError` if a run folder can't be written here; to be called before the run.
+    """Raise `ValueError` if a run folder can't be written here; call it before a long run.
 
-    `resume`: a finished or unfinished run may be there. Raises `BlockingIOError` if another process
-    is writing there.
+    `resume`: allow a finished or an unfinished run. Raises `BlockingIOError` if another process is
+    writing there.
     """
     directory = Path(directory)
     with _writing(directory):
@@ -129,10 +121,7 @@ def summarise(result):
     config = result.config
     return {
         "log": result.log.name,
-        "sensor": config.sensor,
-        "association": config.association,
-        "proposal": config.proposal,
-        "descriptors": config.descriptors,
+        **{k: getattr(config, k) for k in ("sensor", "association", "proposal", "descriptors")},
         "seed": result.seed,
         "n_particles": config.particles,
         "n_steps": len(result.time),
@@ -155,18 +144,16 @@ def summarise(result):
 
 
 def _smoother_summary(result):
-    """The part of `summarise` about genealogy and refinement, as far as the run has them."""
+    """Return the part of `summarise` about genealogy and refinement, as far as the run has them."""
     summary = {}
     if result.ancestral is not None:
         summary["least_ancestors"] = int(np.min(result.ancestral.distinct, initial=2**31))
     if result.refine_seconds is not None:
         summary["refine_seconds"] = result.refine_seconds
     if (refined := result.refined) is not None:
-        summary |= {
-            "refine_rounds": int(refined.rounds),
-            "refine_converged": bool(refined.converged),
-            "n_landmarks_refined": len(refined.mean),
-        }
+        summary["refine_rounds"] = int(refined.rounds)
+        summary["refine_converged"] = bool(refined.converged)
+        summary["n_landmarks_refined"] = len(refined.mean)
     return summary
 
 
@@ -195,20 +182,17 @@ def tum_lines(time, pose):
 def landmark_lines(landmarks):
     """Yield the lines of `landmarks.csv`, numbers with all their digits."""
     yield "id,x,y,sxx,sxy,syy,n\n"
-    for landmark_id, mean, cov, n in zip(
-        landmarks.id, landmarks.mean, landmarks.cov, landmarks.n, strict=True
-    ):
+    columns = landmarks.id, landmarks.mean, landmarks.cov, landmarks.n
+    for landmark_id, mean, cov, n in zip(*columns, strict=True):
         numbers = ",".join(repr(float(value)) for value in (*mean, *cov))
         yield f"{int(landmark_id)},{numbers},{int(n)}\n"
 
 
 def run_toml(result, log):
     """Return the text of `run.toml`: all settings of the run, with defaults filled in."""
-    lines = [
-        f"name = {_toml(result.log.name)}",
-        f"log = {_toml(log)}  # path (from this folder) or name",
-        f"seed = {_toml(result.seed)}",
-    ]
+    lines = [f"name = {_toml(result.log.name)}"]
+    lines += [f"log = {_toml(log)}  # path (from this folder) or name"]
+    lines += [f"seed = {_toml(result.seed)}"]
     lines += ["", "[config]", *_toml_table(vars(result.config))]
     lines += ["", "[params]  # SI units, radians", *_toml_table(result.params._asdict())]
     return "\n".join(lines) + "\n"
@@ -256,8 +240,8 @@ def _log_reference(log_source, target):
 
 @contextmanager
 def _writing(directory, partial=None):
-    """Raise an `OSError` within as one that names the folder, as `ValueError` unless space is short
-    or another process is writing; remove `partial` in the end."""
+    """Turn an `OSError` into one that names the folder, or a `ValueError` if there is space enough
+    and no other process writes; remove `partial` at the end."""
     try:
         yield
     except BlockingIOError:
@@ -274,10 +258,8 @@ def _writing(directory, partial=None):
 
 def _toml(value):
     """Format a text, bool, whole number or float as TOML."""
-    if isinstance(value, str):
+    if isinstance(value, (str, bool)):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, bool):
-        return str(value).lower()
     return repr(int(value) if isinstance(value, Integral) else float(value))
 
 
