@@ -36,8 +36,9 @@ def room(seed, scale=1.0, length_m=80.0):
     noise = {name: scale * value for name, value in NOISE.items()}
     log = planar(
         "room", seed, landmarks=40, length_m=length_m, speed=SPEED, rate_hz=SPEED / STEP,
-        odometry_hz=SPEED / STEP, sigma_range=1e-6, sigma_bearing=radians(scale), landmark_extent=0.0,
-        detection=1.0, outlier=0.0, max_per_frame=None, view=(-np.pi, np.pi, EVERYTHING), **noise,
+        odometry_hz=SPEED / STEP, sigma_range=1e-6, sigma_bearing=radians(scale),
+        landmark_extent=0.0, detection=1.0, outlier=0.0, max_per_frame=None,
+        view=(-np.pi, np.pi, EVERYTHING), **noise,
     )  # fmt: skip
     # the measured range is exact here, so this is the true order
     order = np.lexsort((log.range, log.frame))

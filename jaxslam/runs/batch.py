@@ -24,6 +24,7 @@ from jaxslam.filter.sharding import map_over_devices
 from jaxslam.parameter_file import validate
 from jaxslam.parameters import Params
 from jaxslam.results import run_folder
+from jaxslam.results.tables import format_table
 from jaxslam.runs import compiled, memory
 from jaxslam.runs import run as runner
 from jaxslam.runs.assemble import RunProgress, assemble_result
@@ -212,11 +213,7 @@ def format_runs(rows):
             for label, statistic in (("mean", np.mean), ("sd", partial(np.std, ddof=1))):
                 summary = {name: statistic(column) for name, column in columns.items()}
                 lines.append([label, *values, *_cells(summary, shown)])
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join(
-        "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
-        for line in lines
-    )
+    return format_table(lines, ">" * len(lines[0]))
 
 
 def _value(value):

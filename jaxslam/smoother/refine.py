@@ -47,6 +47,9 @@ class Refined(NamedTuple):
     dropped: int
     residual: float
 
+    def __repr__(self):
+        return f"Refined({len(self.pose)} frames, {len(self.id)} landmarks)"
+
     @property
     def match(self):
         """`landmark_id` by its name of version 0.1."""

@@ -10,6 +10,7 @@ def test_it_says_what_it_is():
     result = make_result()
     assert repr(result) == "Result('circle', range_bearing, 40 frames, 5 landmarks)"
     assert repr(result.landmarks) == "MapEstimate(5 landmarks)"
+    assert repr(make_refined().refined) == "Refined(40 frames, 4 landmarks)"
 
 
 def test_the_trajectory_as_columns():

@@ -5,7 +5,7 @@ Each starts with a header row that is exactly one of these:
     odometry      time_s,forward_m_s,yaw_rate_rad_s   velocities, held until the next row
                   time_s,distance_m,turn_rad          commands: drive, then turn, done at time_s
     measurements  time_s,bearing_rad[,range_m][,identity]
-                  time_s,x_m,y_m,sxx,sxy,syy[,identity]    point in the sensor's frame, covariance m^2
+                  time_s,x_m,y_m,sxx,sxy,syy[,identity]    point in sensor frame, covariance m^2
     truth         time_s,x_m,y_m,theta_rad
     landmarks     id,x_m,y_m                          true landmarks
 
