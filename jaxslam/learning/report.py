@@ -15,6 +15,7 @@ from jaxslam.learning.transforms import from_free
 from jaxslam.learning.uncertainty import MANY
 from jaxslam.parameters import TABLE
 from jaxslam.plotting import FILTER, LANDMARK, RECKONING, REFINED, STYLE, write_figure
+from jaxslam.results.tables import format_table
 
 KNOWN = 2.0  # free scale: standard errors from here on (a factor of 7) are meaningless
 METHODS = {  # `uncertainty.combine_covariances`
@@ -42,16 +43,7 @@ def table(fit, errors):
         numbers = (errors.standard_error[i], errors.monte_carlo_error[i])
         cells += [f"{number:.2g}" if name in known else "-" for number in numbers]
         rows.append((name, *cells, TABLE[name].unit, errors.verdict[i]))
-    return _align(rows, "<>>>><<")
-
-
-def _align(rows, align):
-    """Text of rows of cells, in columns that `align` one by one to the left < or the right >."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return "\n".join(
-        "  ".join(f"{cell:{a}{w}}" for cell, a, w in zip(row, align, widths, strict=True)).rstrip()
-        for row in rows
-    )
+    return format_table(rows, "<>>>><<")
 
 
 def standard_errors(errors):
