@@ -43,14 +43,14 @@ FAR = chi2.ppf(NO_OTHER, 1)
 class Estimate(NamedTuple):
     """What a rival found, T frames of K slots, L landmarks.
 
-    `pose` [T, 3], `cov` [T, 3, 3]: filtered. `row`, `match` [T, K] and `identity` [L] as those of
+    `pose` [T, 3], `cov` [T, 3, 3]: filtered. `row`, `landmark_id` [T, K] and `identity` [L] as those of
     `jaxslam.Result`; `mean` [L, 2] m. `cut`: frames whose search met the limit of nodes.
     """
 
     pose: np.ndarray
     cov: np.ndarray
     row: np.ndarray
-    match: np.ndarray
+    landmark_id: np.ndarray
     mean: np.ndarray
     identity: np.ndarray
     cut: int

@@ -49,7 +49,7 @@ def test_maps_are_nested_and_show_the_same():
 
 def test_a_size_that_does_not_fit_is_refused_before_it_is_made(monkeypatch):
     given = scaling.BASE | dict(particles=10**6, landmarks=1600)
-    monkeypatch.setattr(scaling_one, "available", lambda: 20 * 10**9)
+    monkeypatch.setattr(scaling_one, "available_bytes", lambda: 20 * 10**9)
     size, need = scaling_one.needed(scaling_one.config_of(given))
     assert need > size > 4 * 8 * 10**6 * 1600
     assert "does not fit" in scaling_one.refusal(given)
