@@ -43,8 +43,8 @@ FAR = chi2.ppf(NO_OTHER, 1)
 class Estimate(NamedTuple):
     """What a rival found, T frames of K slots, L landmarks.
 
-    `pose` [T, 3], `cov` [T, 3, 3]: filtered. `row`, `landmark_id` [T, K] and `identity` [L] as those of
-    `jaxslam.Result`; `mean` [L, 2] m. `cut`: frames whose search met the limit of nodes.
+    `pose` [T, 3], `cov` [T, 3, 3]: filtered. `row`, `landmark_id` [T, K] and `identity` [L] as
+    those of `jaxslam.Result`; `mean` [L, 2] m. `cut`: frames whose search met the limit of nodes.
     """
 
     pose: np.ndarray
