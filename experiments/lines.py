@@ -1,4 +1,4 @@
-"""Lines and matches on rendered images against the room's geometry: the README's table of vision.
+"""Lines and matches on rendered images against the room (the tables of docs/results/images.md).
 
     python experiments/lines.py     (about 5 minutes) writes experiments/results/lines.md
 

@@ -10,7 +10,8 @@ EKFs. Forward mode: memory does not grow with the log.
 
 The inherited s fades by a `discount` per step: it describes ever fewer distinct ancestors, and its
 contribution to the current step is mostly noise (Poyiadjis, Doucet and Singh 2011; the discount is
-that of MOP, Tan, Hooker and Ionides 2024). docs/gradients.md says when to distrust which.
+that of MOP, Tan, Hooker and Ionides 2024). When to distrust which is told in
+docs/concepts/score-and-gradients.md.
 """
 
 import dataclasses

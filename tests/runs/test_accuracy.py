@@ -1,4 +1,4 @@
-"""The accuracy the README claims on the bundled log, one seed of each sensor.
+"""The accuracy that docs/results claims on the bundled log, one seed of each sensor.
 
 All seeds: experiments/real_logs.py.
 """
