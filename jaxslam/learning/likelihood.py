@@ -10,8 +10,8 @@ EKFs. Forward mode: memory does not grow with the log.
 
 The inherited s fades by a `discount` per step: it describes ever fewer distinct ancestors, and its
 contribution to the current step is mostly noise (Poyiadjis, Doucet and Singh 2011; the discount is
-that of MOP, Tan, Hooker and Ionides 2024). When to distrust which is told in
-docs/concepts/score-and-gradients.md.
+that of MOP, Tan, Hooker and Ionides 2024). See
+docs/concepts/score-and-gradients.md for when to distrust which.
 """
 
 import dataclasses
